@@ -26,7 +26,7 @@ from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.vision.board import Board, Corners
-from bodyschema.vision.calibration.calibrate import Asked, calibrate
+from bodyschema.vision.calibration.calibrate import CalibrationRequest, calibrate
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.pose import PoseEstimator, Sighting
 from bodyschema.vision.rig.common_error import CommonError
@@ -51,7 +51,7 @@ def calibrated(rng: np.random.Generator) -> Rig:
         seen = np.flatnonzero(((px > 5.0) & (px < size - 6.0)).all(axis=1))
         if len(seen) >= 12:
             views.append(View(str(len(views)), Corners(seen, px[seen]), None))
-    return calibrate(views, BOARD, Asked(CAMERA.image_size_px, ("",), "", model="pinhole")).rig
+    return calibrate(views, BOARD, CalibrationRequest(CAMERA.image_size_px, ("",), "", model="pinhole")).rig
 
 
 def measured(arm: Arm, q: FloatArray, rig: Rig, side_m: float, rng: np.random.Generator) -> tuple[FloatArray, ...]:

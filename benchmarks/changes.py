@@ -38,7 +38,7 @@ from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
 from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning.changes.known_arm import KnownArm, Origin
+from bodyschema.learning.changes.known_arm import ArmBeforeChange, KnownArm
 from bodyschema.learning.changes.monitor import ChangeMonitor, MonitorSettings, Reference
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.status import ChangeRecord, KindOfChange
@@ -196,7 +196,7 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
     cov = sigma**2 * np.eye(3)
     known = reference(arm, q[:known_pairs], x[:known_pairs], np.broadcast_to(cov, (known_pairs, 3, 3)))
     watch = ChangeMonitor()
-    watch.asked()
+    watch.solution_requested()
     watch.offer(known)
     ratios = ((x - arm.positions(q))[known_pairs + at :] * moved).sum(axis=1) - 0.5 * np.square(moved).sum(axis=1)
     information = 0.5 * float(np.square(moved).sum(axis=1).mean()) / sigma**2
@@ -213,10 +213,10 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
             undirected = min(undirected, since if of_all > threshold_of_sum else math.inf)
         if origin is None and watch.alarmed:
             delay, early = since, since <= 0
-            noticed = watch.noticed()
-            if early or noticed is None:
+            detected = watch.detected()
+            if early or detected is None:
                 break
-            origin = Origin(noticed, KnownArm(known.belief, TOLERANCES)), known_pairs + noticed.first
+            origin = ArmBeforeChange(detected, KnownArm(known.belief, TOLERANCES)), known_pairs + detected.first
         if origin is not None and since in NAMED_AFTER:
             found = origin[0].explain(q[origin[1] : known_pairs + k + 1], x[origin[1] : known_pairs + k + 1])
             named[since] = verdict(found, case, joint)
@@ -231,7 +231,7 @@ def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
     A joint offset that cannot be distinguished from a change of the tool or the camera counts as right for these.
     """
     kinds = [KindOfChange(each.kind.name, each.kind.joint, each.probability) for each in found]
-    record = msgspec.structs.replace(ChangeRecord.told(0), kinds=kinds)
+    record = msgspec.structs.replace(ChangeRecord.reported(0), kinds=kinds)
     if record.named is None:
         return UNDECIDED
     right = (record.named.name, record.named.joint) == (case.kind, joint) or record.alike(record.named) == case.kind
@@ -291,14 +291,14 @@ def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
     alarms, watch = 0, ChangeMonitor()
     for k in range(KNOWN, len(q)):
         if (k - KNOWN) % REFIT == 0:
-            watch.asked()
-            if watch.wants_reference:
+            watch.solution_requested()
+            if watch.needs_reference:
                 first = max(0, k - FITTED)
                 watch.offer(reference(arm, q[first:k], x[first:k], covs[first:k]))
         watch.add(pair_of(k, q[k], x[k], covs[k]), kept=not wild[k])
         if watch.alarmed:
             first, alarms, watch = max(0, k - FITTED), alarms + 1, ChangeMonitor()
-            watch.asked()
+            watch.solution_requested()
             watch.offer(reference(arm, q[first:k], x[first:k], covs[first:k]))
     return alarms
 

@@ -65,8 +65,8 @@ def log_statistic(detector: ChangeDetector, q: FloatArray, errors: FloatArray, s
     covariance = noise_of(sigma, 1)
     for k in range(min(first + LONGEST, len(q))):
         detector.add(q[k : k + 1], errors[k : k + 1], covariance)
-        if k >= first and detector.due and (suspicion := detector.suspicion()).alarm:
-            return suspicion.log_odds
+        if k >= first and detector.due and (change_score := detector.change_score()).alarm:
+            return change_score.log_odds
     return math.inf
 
 

@@ -37,7 +37,7 @@ from bodyschema.interfaces.records import FloatArray, MarkerFix, StereoFrame
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from bodyschema.vision.board import Board, BoardDetector, Corners
-from bodyschema.vision.calibration.calibrate import Asked, calibrate
+from bodyschema.vision.calibration.calibrate import CalibrationRequest, calibrate
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.common_error import CommonError
 from bodyschema.vision.rig.rectified import Rectification
@@ -59,7 +59,7 @@ def calibrated(rng: np.random.Generator) -> Rig:
     photographer, detector = Photographer(rig, Printed(), Taken(), rng), BoardDetector(Board())
     found = [detector.find(photographer.left(*pose)) for pose in poses(rng, rig, Printed(), VIEWS)]
     views = [View(str(k), corners, None) for k, corners in enumerate(found) if isinstance(corners, Corners)]
-    return calibrate(views, Board(), Asked(CAMERA.image_size_px, ("",), "", model="pinhole")).rig
+    return calibrate(views, Board(), CalibrationRequest(CAMERA.image_size_px, ("",), "", model="pinhole")).rig
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
-from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, first_pose, mirrored
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, initial_poses, mirrored
 from bodyschema.vision.tags.body import TAG_CORNERS
 from kbmaps import ChainTolerances, RigidChain, RigidLearner, align
 
@@ -69,7 +69,7 @@ def seen(T_camera_tag: FloatArray, rng: np.random.Generator) -> Pose | None:
     x = CORNERS @ T_camera_tag[:3, :3].T + T_camera_tag[:3, 3]
     px = CAMERA.project(x)[:, :2] + CORNER_PX * rng.standard_normal((4, 2))
     estimator = PoseEstimator(CAMERA, [Sighting(CORNERS, px, CORNER_PX**2 * np.eye(8), right=False)])
-    starts = [(R, x0) for R, x0 in first_pose(CAMERA, CORNERS, px)]
+    starts = [(R, x0) for R, x0 in initial_poses(CAMERA, CORNERS, px)]
     found = [estimator.refine(turn, x0) for R, x0 in starts for turn in (R, mirrored(R, x0))]
     poses = sorted((pose for pose in found if pose is not None), key=lambda pose: pose.squares)
     others = [each for each in poses if np.trace(each.rotation.T @ poses[0].rotation) < 1.0 + 2.0 * np.cos(0.05)]

@@ -24,10 +24,10 @@ from bodyschema.cli.cameras.calibration import board_of
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
 from bodyschema.vision.calibration.bundle import view_residuals
-from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate, fit
+from bodyschema.vision.calibration.calibrate import Calibrated, CalibrationRequest, calibrate, fit
 from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.calibration.image_pairs import pair_files, read_pairs
-from bodyschema.vision.calibration.start import pose_of
+from bodyschema.vision.calibration.initial_estimate import pose_of
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.lens import DISTORTION_NAMES, Model
 from bodyschema.vision.rig.stereo_rig import StereoRig, parameter_names, split
@@ -56,7 +56,7 @@ def main() -> None:
 
 def show(views: Sequence[View], board: Board, size_px: tuple[int, int]) -> None:
     """Print the table of both calibrations."""
-    ours = calibrate(views, board, Asked(size_px, ("", ""), "", scale_sigma=0.0), print)
+    ours = calibrate(views, board, CalibrationRequest(size_px, ("", ""), "", scale_sigma=0.0), print)
     pairs = [view for view in views if view.is_stereo]
     theirs = opencv(pairs, board, size_px, ours.rig.model)
     if theirs is None:
@@ -94,7 +94,7 @@ def rows(ours: Calibrated, theirs: FloatArray | None) -> list[tuple[str, str, st
     distance = 1e3 * float(np.linalg.norm(other[-3:]))
     baseline = f"{1e3 * rig.baseline_m:.3f}", f"{1e3 * rig.baseline_sigma_m:.3f}", f"{distance:.3f}"
     # A point has two coordinates.
-    errors = [f"{np.sqrt(2) * each:.3f}" for each in (rig.made.reprojection_px, rig.made.held_out_px)]
+    errors = [f"{np.sqrt(2) * each:.3f}" for each in (rig.provenance.reprojection_px, rig.provenance.held_out_px)]
     return [
         *table,
         ("baseline [mm]", *baseline),

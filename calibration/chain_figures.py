@@ -23,13 +23,15 @@ IntArray = NDArray[np.intp]
 
 
 class _Settings:
-    told_within: float = 4.0  # where what is probable differs by more than this, the pairs do not tell
-    not_shown: float = 0.9  # a zero that is still as uncertain as it was before is nothing that the pairs show
+    max_ratio: float = 4.0  # where what is probable differs by more than this, the pairs do not tell
+    min_unidentified_share: float = (
+        0.9  # a zero that is still as uncertain as it was before is nothing that the pairs show
+    )
     step: float = 1e-6  # of the numerical derivatives by tilts, shifts and zeros [rad, m]
     # Poses that stand for all, and the noise of exact pairs [m].
     poses: int = 100
     exact_m: float = 1e-6
-    relinearised: int = 4  # from one linearisation to the next the error along a curve is squared
+    linearisations: int = 4  # from one linearisation to the next the error along a curve is squared
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +69,14 @@ class ChainFigures:
         for belief, share in zip(self.beliefs, self.shares, strict=True):
             split = self._split(belief)
             steps = _Settings.step * np.eye(len(split))
-            here = self._figures(split)
-            jacobian = np.array([_unwound(self._figures(moved) - here) for moved in split + steps]).T / _Settings.step
-            apart = _unwound(self._figures(split) - self.values)
-            inner = _given(belief.covariance, self._hidden)
-            covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
+            figures = self._figures(split)
+            jacobian = (
+                np.array([_wrap_camera_angles(self._figures(moved) - figures) for moved in split + steps]).T
+                / _Settings.step
+            )
+            offset = _wrap_camera_angles(self._figures(split) - self.values)
+            conditioned = _conditioned(belief.covariance, self._unidentified)
+            covariance += share * (jacobian @ conditioned @ jacobian.T + np.outer(offset, offset))
         return covariance
 
     def hand_eye(self, frame: str) -> HandEye:
@@ -93,32 +98,34 @@ class ChainFigures:
         posterior that was linearised at several places seems more certain than it is.
         """
         zeros = self._zeros
-        return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
+        return (_spread(self.beliefs[0], zeros) < self._unidentified_std) & (
+            _spread(self._exactly_informed, zeros) < self._unidentified_std
+        )
 
     @property
     def moved(self) -> FloatArray:
         """`values` minus `drawn` (9 + d,), angles the shorter way round."""
-        return _unwound(self.values - self.drawn)
+        return _wrap_camera_angles(self.values - self.drawn)
 
     @property
-    def _unsure(self) -> FloatArray:
-        return _Settings.not_shown * _spread(self.prior, self._zeros)
+    def _unidentified_std(self) -> FloatArray:
+        return _Settings.min_unidentified_share * _spread(self.prior, self._zeros)
 
     @cached_property
-    def _best(self) -> ChainBelief:
-        return after_exact_pairs(self.prior, self.beliefs[0].mean, self.robot)
+    def _exactly_informed(self) -> ChainBelief:
+        return posterior_of_exact_pairs(self.prior, self.beliefs[0].mean, self.robot)
 
     def _split(self, belief: ChainBelief) -> FloatArray:
         """Return the most probable change (size,) with the joint offsets that are not identifiable kept at nominal."""
-        drawn = self._hidden
+        unidentified = self._unidentified
         covariance = belief.covariance
-        gain = np.linalg.solve(covariance[np.ix_(drawn, drawn)], covariance[drawn])
-        split = belief.mean - belief.mean[drawn] @ gain
-        split[drawn] = 0.0
+        gain = np.linalg.solve(covariance[np.ix_(unidentified, unidentified)], covariance[unidentified])
+        split = belief.mean - belief.mean[unidentified] @ gain
+        split[unidentified] = 0.0
         return split
 
     @property
-    def _hidden(self) -> IntArray:
+    def _unidentified(self) -> IntArray:
         """Indices of the joint offsets that are not identifiable, without those that are fixed at nominal."""
         return self._zeros[~self.shown & (_spread(self.prior, self._zeros) > 0.0)]
 
@@ -148,7 +155,7 @@ class ChainFigures:
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
 
-def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
+def posterior_of_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
     """Return the posterior after exact pairs of all poses, linearised at a change (size,)."""
     _, jacobian = prior.parameters.linearised(change, _poses(robot))
     rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _Settings.exact_m
@@ -156,24 +163,24 @@ def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescri
     return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
 
 
-def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> FloatArray:
+def most_probable_equivalent(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> FloatArray:
     """Return the change (size,) most probable under the prior among all that give the same positions as `change`.
 
     These changes lie along a curve, so several linearisations are needed.
     """
     poses = _poses(robot)
-    same, found = prior.parameters.positions(change, poses), change
-    for _ in range(_Settings.relinearised):
+    positions, found = prior.parameters.positions(change, poses), change
+    for _ in range(_Settings.linearisations):
         x, jacobian = prior.parameters.linearised(found, poses)
         u, singular, vt = np.linalg.svd(
             (jacobian @ prior.root).reshape(3 * _Settings.poses, -1) / _Settings.exact_m, full_matrices=False
         )
-        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _Settings.exact_m
+        target = (positions - x + jacobian @ (found - prior.mean)).ravel() / _Settings.exact_m
         found = prior.mean + prior.root @ (vt.T @ (singular / (1.0 + np.square(singular)) * (u.T @ target)))
     return found
 
 
-def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
+def limited_to_exact_pairs(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
     """Return a posterior made in several linearisations, with the prior restored where pairs are uninformative.
 
     Chains that give the same positions lie along a curve, and its tangents differ from place to place. Pairs that were
@@ -181,13 +188,15 @@ def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: Robot
     2010, on the consistency of the extended Kalman filter). In no direction is the returned posterior more certain than
     exact pairs would make it. Along directions that pairs do not determine, its mean moves to the maximum of the prior.
     """
-    change = most_probable_alike(prior, belief.mean, robot)
-    best = after_exact_pairs(prior, change, robot)
+    change = most_probable_equivalent(prior, belief.mean, robot)
+    best = posterior_of_exact_pairs(prior, change, robot)
     free = np.flatnonzero(prior.root.any(axis=1))
     std = _spread(prior, free)
-    own, least = (scaled @ scaled.T for scaled in (each.root[free] / std[:, None] for each in (belief, best)))
-    factor = np.linalg.cholesky(own + least)
-    half = np.linalg.solve(factor, np.linalg.solve(factor, least).T)
+    own_covariance, least_covariance = (
+        scaled @ scaled.T for scaled in (each.root[free] / std[:, None] for each in (belief, best))
+    )
+    factor = np.linalg.cholesky(own_covariance + least_covariance)
+    half = np.linalg.solve(factor, np.linalg.solve(factor, least_covariance).T)
     shares, vectors = np.linalg.eigh((half + half.T) / 2.0)
     root = np.zeros((len(belief.mean), len(free)))
     root[free] = std[:, None] * (factor @ vectors) * np.sqrt(np.maximum(shares, 1.0 - shares))
@@ -199,10 +208,10 @@ def _poses(robot: RobotDescription) -> FloatArray:
     return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_Settings.poses, len(robot.joints)))
 
 
-def is_told(made: Sequence[tuple[float, float]]) -> bool:
-    """Return True if the probable tolerances (axes [rad], positions [m]) agree within the factor `told_within`."""
-    axes = [axes for axes, _ in made]
-    return max(axes) <= _Settings.told_within * min(axes)
+def tolerances_determined(tolerances: Sequence[tuple[float, float]]) -> bool:
+    """Return True if the probable tolerances (axes [rad], positions [m]) agree within the factor `max_ratio`."""
+    axes = [axes for axes, _ in tolerances]
+    return max(axes) <= _Settings.max_ratio * min(axes)
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
@@ -210,13 +219,13 @@ def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
     return np.sqrt(np.square(belief.root[which]).sum(axis=1))
 
 
-def _given(covariance: FloatArray, known: IntArray) -> FloatArray:
+def _conditioned(covariance: FloatArray, known: IntArray) -> FloatArray:
     """Return the covariance (m, m) of a Gaussian conditioned on some of its components."""
     across = covariance[:, known]
     return covariance - across @ np.linalg.solve(covariance[np.ix_(known, known)], across.T)
 
 
-def _unwound(difference: FloatArray) -> FloatArray:
+def _wrap_camera_angles(difference: FloatArray) -> FloatArray:
     """Wrap the camera angles of a difference of figures (9 + d,) to [-π, π), in place, and return it."""
     difference[3:6] = np.remainder(difference[3:6] + np.pi, 2.0 * np.pi) - np.pi
     return difference

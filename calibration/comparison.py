@@ -33,9 +33,9 @@ class Distances(msgspec.Struct, frozen=True):
     max_mm: float
 
     @classmethod
-    def of(cls, apart: FloatArray) -> Distances:
+    def of(cls, differences: FloatArray) -> Distances:
         """Return the figures of differences (n, 3) [m]."""
-        distance = 1e3 * np.linalg.norm(apart, axis=1)
+        distance = 1e3 * np.linalg.norm(differences, axis=1)
         rms = math.sqrt(float(np.mean(distance**2)))
         return cls(float(distance.mean()), rms, float(np.median(distance)), float(distance.max()))
 
@@ -117,25 +117,25 @@ def compared(first: Recording, second: Recording, names: tuple[str, str]) -> Com
     left_out = _left_out(first, other_q, match)
     if not len(match.first):
         raise RecordingError(
-            f"has no row at the joint angles of one in {names[0]}{_most(left_out)}",
+            f"has no row at the joint angles of one in {names[0]}{_largest_difference(left_out)}",
             file=names[1],
             remedy=f"`bodyschema simulate --like {names[0]}` gives one that has",
         )
     x, other = first.x[match.first], second.x[match.second]
-    apart = other - x
+    differences = other - x
     return ComparisonReport(
         first=names[0],
         second=names[1],
         joints=first.joints,
         rows=len(first),
         other_rows=len(second),
-        compared=len(apart),
+        compared=len(differences),
         left_out=left_out,
-        distances=Distances.of(apart),
-        axis_mean_mm=_three(1e3 * apart.mean(axis=0)),
-        axis_rms_mm=_three(1e3 * np.sqrt((apart**2).mean(axis=0))),
+        distances=Distances.of(differences),
+        axis_mean_mm=_as_tuple(1e3 * differences.mean(axis=0)),
+        axis_rms_mm=_as_tuple(1e3 * np.sqrt((differences**2).mean(axis=0))),
         aligned=_aligned(x, other),
-        worst=_worst(first, match, apart),
+        worst=_worst(first, match, differences),
     )
 
 
@@ -170,37 +170,37 @@ def _number(rows: NDArray[np.int64]) -> int | None:
     return int(rows[0]) + 1 if len(rows) else None
 
 
-def _most(left_out: LeftOut) -> str:
+def _largest_difference(left_out: LeftOut) -> str:
     return "" if left_out.joint is None else f"; in the first, {left_out.joint} differs by {left_out.by:.4g}"
 
 
 def _aligned(x: FloatArray, other: FloatArray) -> Aligned | None:
     if len(x) < _Settings.fewest_aligned:
         return None
-    moved, turn = laid_on(x, other)
+    moved, turn = aligned_to(x, other)
     angle = float(np.degrees(Rotation.from_matrix(turn).magnitude()))
-    return Aligned(Distances.of(moved - x), _three(1e3 * (x.mean(axis=0) - other.mean(axis=0))), angle)
+    return Aligned(Distances.of(moved - x), _as_tuple(1e3 * (x.mean(axis=0) - other.mean(axis=0))), angle)
 
 
-def laid_on(x: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+def aligned_to(x: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the positions `other` (n, 3) rigidly aligned with `x` (n, 3), and the rotation (3, 3)."""
     turn, shift = rigid_motion(other, x, np.ones(len(x)))
     return other @ turn.T + shift, turn
 
 
-def _worst(first: Recording, match: _Match, apart: FloatArray) -> tuple[WorstRow, ...]:
-    distance = np.linalg.norm(apart, axis=1)
+def _worst(first: Recording, match: _Match, differences: FloatArray) -> tuple[WorstRow, ...]:
+    distance = np.linalg.norm(differences, axis=1)
     return tuple(
         WorstRow(
             int(match.first[k]) + 1,
             int(match.second[k]) + 1,
             1e3 * float(distance[k]),
-            _three(1e3 * apart[k]),
+            _as_tuple(1e3 * differences[k]),
             tuple(first.q[match.first[k]].tolist()),
         )
         for k in np.argsort(-distance, kind="stable")[: _Settings.worst_rows]
     )
 
 
-def _three(values: FloatArray) -> tuple[float, float, float]:
+def _as_tuple(values: FloatArray) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])

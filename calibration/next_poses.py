@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import require_target, write_whole, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, require_target, write_atomically
 from bodyschema.robot.description import link_poses
 from kbmaps import ChainPosterior, ExperimentDesign, next_poses
 
@@ -85,8 +85,8 @@ class NextPoses:
             RecordingError: the file exists already, or cannot be written.
         """
         check_target(file, replace=replace)
-        with writing(file, RecordingError):
-            write_whole({file: self._json() if file.suffix.lower() == JSON else self._csv()})
+        with raising_write_errors(file, RecordingError):
+            write_atomically({file: self._json() if file.suffix.lower() == JSON else self._csv()})
 
     def _json(self) -> bytes:
         value = {

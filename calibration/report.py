@@ -195,16 +195,16 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         """
         jump = tool_jump(calibration.learner, calibration.recording)
         robot, recording, learner = calibration.robot, calibration.recording, calibration.learner
-        report, made, slides = learner.report(), calibration.workmanship, robot.chain.prismatic
+        report, made, slides = learner.report(), calibration.estimated_tolerances, robot.chain.prismatic
         named, expected = calibration.figures, calibration.expected
         zeros = _zeros(calibration, named.values[9:], named.half_widths[9:])
-        made_badly = _badly_made(calibration)
-        beyond = [*_far_off(calibration, zeros, _Settings.too_far_off), *made_badly]
+        made_badly = _large_tolerances(calibration)
+        beyond = [*_improbable_zeros(calibration, zeros, _Settings.too_far_off), *made_badly]
         drawn_error_m = _mean_error(calibration.placed.chain.positions(recording.q), recording)
-        doubts = [*seen.sentences, *_computed(drawn_error_m), *_stamped_late(calibration)]
+        doubts = [*seen.sentences, *_looks_simulated(drawn_error_m), *_stamped_late(calibration)]
         doubts += _many_left_out(calibration, first)
         if jump is None:  # figures of two tools mixed belong to neither
-            doubts += [*_far_off(calibration, zeros, _Settings.far_off), *made_badly]
+            doubts += [*_improbable_zeros(calibration, zeros, _Settings.far_off), *made_badly]
         values, halves = named.values, named.half_widths
         figures = [
             Figure(*(float(unit * number) for number in numbers))
@@ -222,7 +222,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             marker_xyz_mm=figures[6:],
             zeros=zeros,
             noise_mm=1e3 * calibration.noise_m,
-            told_noise_mm=1e3 * report.noise if calibration.noise_told else None,
+            told_noise_mm=1e3 * report.noise if calibration.noise_given else None,
             misfit=report.misfit,
             drawn_error_mm=1e3 * drawn_error_m,
             learnt_error_mm=1e3 * float(np.linalg.norm(calibration.residuals, axis=1).mean()),
@@ -260,7 +260,7 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
     ]
 
 
-def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
+def _improbable_zeros(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
     """Return messages about joint offsets larger than `times` their tolerance."""
     told = calibration.learner.tolerances
     said: list[str] = []
@@ -275,7 +275,7 @@ def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[
     return said
 
 
-def _computed(drawn_error_m: float) -> list[str]:
+def _looks_simulated(drawn_error_m: float) -> list[str]:
     """Return a message if the nominal arm, only placed, fits the positions better than any real one."""
     if drawn_error_m > _Settings.computed_m:
         return []
@@ -322,9 +322,9 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
     ]
 
 
-def _badly_made(calibration: Calibration) -> list[str]:
+def _large_tolerances(calibration: Calibration) -> list[str]:
     """Return a message if the geometric errors reach the largest that are considered, otherwise an empty list."""
-    made, (axes, points) = calibration.workmanship, ToleranceSettings.workmanship[-1]
+    made, (axes, points) = calibration.estimated_tolerances, ToleranceSettings.estimated_tolerances[-1]
     if made is None or made.axes < axes:
         return []
     return [

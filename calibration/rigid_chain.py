@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable_indices
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
@@ -30,7 +30,7 @@ from kbmaps import (
 )
 from kbmaps.robust import RobustSettings
 
-from .chain_figures import ChainFigures, is_told
+from .chain_figures import ChainFigures, tolerances_determined
 
 IntArray = NDArray[np.intp]
 Trusted = Literal["nothing", "links", "urdf"]
@@ -38,10 +38,10 @@ Trusted = Literal["nothing", "links", "urdf"]
 
 class _Settings:
     # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
-    judged_pairs: int = 300
+    tolerance_pairs: int = 300
     slide_zeros_m: float = 0.02
     # A parameter counts as determined if its uncertainty falls below this share of the prior one.
-    much_surer: float = 1.0 / 3.0
+    max_share: float = 1.0 / 3.0
     # Of what is said to be known, and of what is not, once it has been fitted: then far more than the fit can be off.
     known_turn_rad: float = 0.02
     known_place_m: float = 0.01
@@ -77,7 +77,7 @@ class Calibration:
     # of all pairs, with the tolerances that the pairs make probable, the most probable first
     learners: tuple[RigidLearner, ...]
     shares: FloatArray  # their probabilities (m,), which add up to 1
-    noise_told: bool  # True if the noise was given, False if it was estimated
+    noise_given: bool  # True if the noise was given, False if it was estimated
     trusted: Trusted = "nothing"  # the parts held at the URDF's values
     # errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None if none are known
     common: FloatArray | None = None
@@ -105,7 +105,7 @@ class Calibration:
         Raises:
             CalibrationError: there are too few pairs, or they do not fit the robot at all.
         """
-        needed = fewest_pairs(len(robot.joints), trusted)
+        needed = min_pairs(len(robot.joints), trusted)
         if len(recording) < needed:
             raise CalibrationError(
                 f"{len(recording)} pairs are too few to calibrate {len(robot.joints)} joints; record at least {needed}"
@@ -123,24 +123,24 @@ class Calibration:
             learners[0].report()  # fitted, so that it shows the errors that cannot be fitted
         except KBMapsError as error:
             raise CalibrationError(f"no chain can be fitted to the recording: {error}") from error
-        told = sigma_m is not None or recording.cov is not None
-        return cls(robot, recording, placed, learners, shares, told, trusted, shared)
+        stated = sigma_m is not None or recording.cov is not None
+        return cls(robot, recording, placed, learners, shares, stated, trusted, shared)
 
     @property
     def learner(self) -> RigidLearner:
         return self.learners[0]
 
     @property
-    def workmanship(self) -> ChainTolerances | None:
+    def estimated_tolerances(self) -> ChainTolerances | None:
         """Estimated tolerances of the arm; None if the pairs do not determine them."""
-        made = [(learner.tolerances.axes, learner.tolerances.points) for learner in self.learners]
-        return self.learner.tolerances if is_told(made) else None
+        candidates = [(learner.tolerances.axes, learner.tolerances.points) for learner in self.learners]
+        return self.learner.tolerances if tolerances_determined(candidates) else None
 
     @property
     def noise_m(self) -> float:
         """1-sigma of a measured coordinate [m], from the pairs' scatter around the learnt chain, without outliers."""
         report = self.learner.report()
-        if not self.noise_told:
+        if not self.noise_given:
             return report.noise
         squares = np.sort(np.square(self.residuals).sum(axis=1))
         return float(np.sqrt(squares[: len(squares) - report.outliers].sum() / max(report.freedom, 1.0)))
@@ -157,41 +157,41 @@ class Calibration:
         fold = np.arange(rows) * 2 * _Settings.folds // rows % _Settings.folds
         if rows < _Settings.folds * 2 * len(self.robot.joints):
             return None
-        sigma_m = self.learner.report().noise if self.noise_told else None
-        told = _told(self.recording, self.learner, np.arange(rows), self.common)
+        sigma_m = self.learner.report().noise if self.noise_given else None
+        stated = _stated_covariances(self.recording, self.learner, np.arange(rows), self.common)
         distances = np.empty(rows)
         for held_out in range(_Settings.folds):
             kept = np.flatnonzero(fold != held_out)
             kept = kept[np.unique(np.linspace(0, len(kept) - 1, _Settings.fold_rows).astype(np.intp))]
-            fresh = RigidLearner(self.placed.chain, self.learner.tolerances)
-            _learn(fresh, self.recording, kept, sigma_m, told, self.common)
+            new_learner = RigidLearner(self.placed.chain, self.learner.tolerances)
+            _learn(new_learner, self.recording, kept, sigma_m, stated, self.common)
             try:
-                apart = _residuals(fresh, self.recording, np.flatnonzero(fold == held_out), self.common)
+                residuals = _residuals(new_learner, self.recording, np.flatnonzero(fold == held_out), self.common)
             except KBMapsError:
                 return None
-            distances[fold == held_out] = np.linalg.norm(apart, axis=1)
+            distances[fold == held_out] = np.linalg.norm(residuals, axis=1)
         distances = distances[self.learner.inliers]
         return Expected(float(distances.mean()), float(np.quantile(distances, 0.95)))
 
     @cached_property
     def shown(self) -> int:
-        """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`much_surer`).
+        """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`max_share`).
 
         The prior allows an arm of the widest tolerances.
         """
-        report, (axes, points) = self.learner.report(), ToleranceSettings.workmanship[-1]
+        report, (axes, points) = self.learner.report(), ToleranceSettings.estimated_tolerances[-1]
         parameters = ChainParameters(self.placed.chain)
         before = ChainBelief.from_tolerances(parameters, replace(self.learner.tolerances, axes=axes, points=points))
         _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
         rows = (jacobian @ before.root).reshape(-1, before.root.shape[1]) / (report.noise * report.misfit)
-        left = 1.0 / np.sqrt(1.0 + np.square(np.linalg.svd(rows, compute_uv=False)))
-        return int((left < _Settings.much_surer).sum())
+        remaining_share = 1.0 / np.sqrt(1.0 + np.square(np.linalg.svd(rows, compute_uv=False)))
+        return int((remaining_share < _Settings.max_share).sum())
 
     @cached_property
     def figures(self) -> ChainFigures:
         """Calibrated figures; their uncertainty includes that of the tolerances."""
         prior = ChainBelief.from_tolerances(ChainParameters(self.placed.chain), self.learner.tolerances)
-        return ChainFigures(self.robot, tuple(map(_claimed, self.learners)), self.shares, prior)
+        return ChainFigures(self.robot, tuple(map(_widened_belief, self.learners)), self.shares, prior)
 
 
 def _learners(
@@ -202,24 +202,24 @@ def _learners(
     common: FloatArray | None,
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Return learners of all pairs for the tolerances that a sample of the pairs makes probable, and their weights."""
-    told = None if recording.cov is None else recording.cov + RobustSettings.rounding_m**2 * np.eye(3)
-    some = np.unique(np.linspace(0, len(recording) - 1, _Settings.judged_pairs).astype(np.intp))
+    stated = None if recording.cov is None else recording.cov + RobustSettings.rounding_m**2 * np.eye(3)
+    sample = np.unique(np.linspace(0, len(recording) - 1, _Settings.tolerance_pairs).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
-        fresh = RigidLearner(nominal, tolerances)
-        _learn(fresh, recording, rows, sigma_m, told, common)
-        return fresh
+        new_learner = RigidLearner(nominal, tolerances)
+        _learn(new_learner, recording, rows, sigma_m, stated, common)
+        return new_learner
 
-    told = _told(recording, learner(choices[-1], some), some, common)
-    evidence = np.array([learner(tolerances, some).log_evidence for tolerances in choices])
-    kept, shares = probable(evidence)
-    everything = np.arange(len(recording))
-    return tuple(learner(choices[k], everything) for k in kept), shares
+    stated = _stated_covariances(recording, learner(choices[-1], sample), sample, common)
+    evidence = np.array([learner(tolerances, sample).log_evidence for tolerances in choices])
+    kept, shares = probable_indices(evidence)
+    all_rows = np.arange(len(recording))
+    return tuple(learner(choices[k], all_rows) for k in kept), shares
 
 
 def _residuals(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> FloatArray:
-    apart = recording.x[rows] - learner.predict(recording.q[rows])
-    return apart if common is None else apart - common[rows] @ learner.unknowns
+    residuals = recording.x[rows] - learner.predict(recording.q[rows])
+    return residuals if common is None else residuals - common[rows] @ learner.unknowns
 
 
 def _learn(
@@ -227,22 +227,24 @@ def _learn(
     recording: Recording,
     rows: IntArray,
     sigma_m: float | None,
-    told: FloatArray | None,
+    stated: FloatArray | None,
     common: FloatArray | None,
 ) -> None:
-    noise = {"sigma": sigma_m} if told is None else {"cov": told[rows]}
+    noise = {"sigma": sigma_m} if stated is None else {"cov": stated[rows]}
     shared = None if common is None else common[rows]
     learner.learn(recording.q[rows], recording.x[rows], **noise, common=shared)
 
 
-def _told(recording: Recording, learner: RigidLearner, rows: IntArray, common: FloatArray | None) -> FloatArray | None:
+def _stated_covariances(
+    recording: Recording, learner: RigidLearner, rows: IntArray, common: FloatArray | None
+) -> FloatArray | None:
     """Return the stated covariances (n, 3, 3) [m²], the arm's share added in some rows; None if none are stated."""
     if recording.cov is None:
         return None
-    return recording.cov + (RobustSettings.rounding_m**2 + _of_the_arm(learner, recording, rows, common)) * np.eye(3)
+    return recording.cov + (RobustSettings.rounding_m**2 + _arm_variance(learner, recording, rows, common)) * np.eye(3)
 
 
-def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> float:
+def _arm_variance(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> float:
     """Return the variance [m²] per coordinate of these rows beyond the instrument's: encoders, backlash."""
     assert recording.cov is not None
     good = rows[learner.inliers]
@@ -251,7 +253,7 @@ def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, com
     return unexplained_variance(residuals, recording.cov[good] + RobustSettings.rounding_m**2 * np.eye(3), freedom)
 
 
-def fewest_pairs(joints: int, trusted: Trusted) -> int:
+def min_pairs(joints: int, trusted: Trusted) -> int:
     """Return the number of pairs needed: two for each joint, or twice the unknowns if the URDF is trusted."""
     unknowns = 9 + (joints if trusted == "links" else 0)
     return 2 * joints if trusted == "nothing" else min(2 * joints, math.ceil(2 * unknowns / 3))
@@ -265,7 +267,7 @@ def _tolerances(
     The frame's pose is a rotation about this origin and a shift: from afar, a small rotation of the arm is a long
     shift.
     """
-    links = ToleranceSettings.workmanship if trusted == "nothing" else ((0.0, 0.0),)
+    links = ToleranceSettings.estimated_tolerances if trusted == "nothing" else ((0.0, 0.0),)
     free_zeros = trusted != "urdf"
     pose_known, marker_known = robot.camera.pose_known, robot.robot.marker_known
     fitted_place_m = max(_Settings.fitted_place_m, _Settings.fitted_turn_rad * distance_m)
@@ -283,7 +285,7 @@ def _tolerances(
     ]
 
 
-def _claimed(learner: RigidLearner) -> ChainBelief:
+def _widened_belief(learner: RigidLearner) -> ChainBelief:
     """Return the learner's posterior, widened like its intervals to allow for an estimated noise level."""
     belief = learner.belief
     return replace(belief, root=learner.report().widening * belief.root)

@@ -158,16 +158,16 @@ def _print_front_page() -> None:
     sys.stdout.write(front_page(shutil.get_terminal_size().columns, colour=colour, signs=signs))
 
 
-def _told(error: OSError) -> BodyschemaError:
+def _as_message(error: OSError) -> BodyschemaError:
     """Return an operating system's error, which no command handled, as an error of one line."""
-    said = error.strerror or str(error)
+    reason = error.strerror or str(error)
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return BodyschemaError(f"too many files and connections are open. {RAISE_LIMIT}")
     if error.filename is not None:
-        return BodyschemaError(f"{os.fsdecode(error.filename)}: {said}")
+        return BodyschemaError(f"{os.fsdecode(error.filename)}: {reason}")
     if isinstance(error, FileNotFoundError):
         return BodyschemaError("the current folder was deleted. Change into another")
-    return BodyschemaError(f"the output cannot be written: {said}")
+    return BodyschemaError(f"the output cannot be written: {reason}")
 
 
 def _drop_output() -> None:
@@ -216,7 +216,7 @@ def main() -> None:
         sys.exit(1)
     except OSError as error:
         _drop_output()
-        _fail(_told(error))
+        _fail(_as_message(error))
 
 
 if __name__ == "__main__":

@@ -297,16 +297,16 @@ def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, 
     match tables.vision.marker:
         case "ball" | "bright_ball":
             place, what = ("vision", "radius_m"), "the ball's radius [m]"
-            said = "radius_m" in vision
+            message = "radius_m" in vision
         case "tag":
             place, what = ("vision", "tag", "side_m"), "the side of the tag's black square [m]"
-            said = "side_m" in vision.get("tag", {})
+            message = "side_m" in vision.get("tag", {})
         case "cluster":
             place, what = ("vision", "tag", "side_m"), "the side of the tags' black squares [m]"
-            said = "side_m" in vision.get("tag", {}) or all(tag.side_m for tag in tables.vision.cluster.tags)
+            message = "side_m" in vision.get("tag", {}) or all(tag.side_m for tag in tables.vision.cluster.tags)
         case "chessboard" | "plugin":
             return
-    if not said:
+    if not message:
         raise ConfigError(
             f"{'.'.join(place)} is missing: one camera alone takes the depth from the marker's size",
             file=file,
@@ -361,8 +361,8 @@ def _checked(variable: str, table: str, key: str, value: Any) -> Any:
     try:
         msgspec.convert(value, fields[key])
     except msgspec.ValidationError as error:
-        said = with_choices(str(error), fields[key])
-        raise ConfigError(f"the environment variable {variable}: {said[:1].lower()}{said[1:]}") from error
+        message = with_choices(str(error), fields[key])
+        raise ConfigError(f"the environment variable {variable}: {message[:1].lower()}{message[1:]}") from error
     return value
 
 

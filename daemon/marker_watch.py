@@ -13,13 +13,13 @@ from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 from bodyschema.interfaces.rejections import WORDS
 
 from .sampler.reconnect import ReconnectingSource
-from .sampler.sources import TellsHealth
+from .sampler.sources import ReportsHealth
 
 
 class MarkerWatch:
     """A marker source that is read for display. It is reopened after a loss."""
 
-    def __init__(self, name: str, source: MarkerSource, health: TellsHealth, clock: Clock) -> None:
+    def __init__(self, name: str, source: MarkerSource, health: ReportsHealth, clock: Clock) -> None:
         """Store the settings; nothing is opened yet.
 
         Args:
@@ -41,8 +41,8 @@ class MarkerWatch:
     def read(self, timeout_s: float) -> None:
         """Read all positions that arrive within `timeout_s`."""
         end = self._clock.now() + timeout_s
-        while (left := end - self._clock.now()) > 0:
-            seen = self._source.read(left)
+        while (remaining_s := end - self._clock.now()) > 0:
+            seen = self._source.read(remaining_s)
             if isinstance(seen, MarkerFix):
                 self._fixes += 1
                 self._last, self._delay_s = seen, self._clock.now() - seen.t

@@ -28,7 +28,7 @@ from bodyschema.interfaces.errors import BusError, RequestError
 if TYPE_CHECKING:
     from bodyschema.dashboard.diagnosing import Diagnoses
     from bodyschema.dashboard.shapes import Body
-    from bodyschema.dashboard.watch import Watch
+    from bodyschema.dashboard.watch import ProcessFollower
 
 _READING = ("GET", "HEAD")
 _HEADERS = HEADERS | {
@@ -108,7 +108,7 @@ class PageCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _Endpoints:
     """Endpoints of the page's routes."""
 
-    def __init__(self, hub: Hub, processes: Watch, diagnoses: Diagnoses, shapes: Body) -> None:
+    def __init__(self, hub: Hub, processes: ProcessFollower, diagnoses: Diagnoses, shapes: Body) -> None:
         self._hub, self._processes, self._diagnoses, self._shapes = hub, processes, diagnoses, shapes
         self._for_shapes = asyncio.Semaphore(AppSettings.most_for_shapes)
 
@@ -164,7 +164,7 @@ class _Endpoints:
         return Response(page, media_type="text/html", headers={"Content-Security-Policy": _REPORT_POLICY})
 
 
-def application(hub: Hub, processes: Watch, diagnoses: Diagnoses, shapes: Body) -> Starlette:
+def application(hub: Hub, processes: ProcessFollower, diagnoses: Diagnoses, shapes: Body) -> Starlette:
     """Return the page's application on the documents of `hub`."""
     page = _Endpoints(hub, processes, diagnoses, shapes)
     routes = [
@@ -222,7 +222,7 @@ class _EventStream(StreamingResponse):
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._hub.leave(self._follower)
+            self._hub.unfollow(self._follower)
 
 
 async def _events(hub: Hub, follower: Follower) -> AsyncIterator[bytes]:

@@ -46,7 +46,7 @@ class Series:
         return SeriesDocument(*columns)
 
 
-class Course:
+class ChangeHistory:
     """History of changes and answering models, from the learner's successive states."""
 
     def __init__(self) -> None:
@@ -61,8 +61,8 @@ class Course:
 
     def note(self, status: LearnerStatus, now: float) -> None:
         """Add the learner's status at this time, UTC [s since 1970]."""
-        begun_anew = self._versions and status.pairs < self._versions[-1].pairs
-        if begun_anew or status.store != self._store:
+        store_changed = self._versions and status.pairs < self._versions[-1].pairs
+        if store_changed or status.store != self._store:
             self._changes, self._versions, self._store = {}, [], status.store
         changed = self._note_change(status, now)
         if status.model:

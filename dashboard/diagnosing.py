@@ -41,16 +41,16 @@ class Diagnoses:
         robot_file: Path,
         joints: tuple[str, ...],
         history: Callable[[int], History],
-        tell: Callable[[DiagnosisDocument], None],
+        on_change: Callable[[DiagnosisDocument], None],
     ) -> None:
-        self._robot_file, self._joints, self._history, self._tell = robot_file, joints, history, tell
+        self._robot_file, self._joints, self._history, self._on_change = robot_file, joints, history, on_change
         self._lock = threading.Lock()
         self._document = DiagnosisDocument()
         self._thread: threading.Thread | None = None
         self._child: subprocess.Popen[str] | None = None
         self._stopping = False
         self._folder = tempfile.TemporaryDirectory(prefix="bodyschema-view-")
-        tell(self._document)
+        on_change(self._document)
 
     def __enter__(self) -> Self:
         return self
@@ -69,7 +69,7 @@ class Diagnoses:
             number = self._document.number + 1
             self._stopping = False
             self._thread = threading.Thread(target=self._run, args=(number,), name="diagnosis")
-            self._say(number=number, state="copying", pairs=0, said="", started=time.time(), verdict=None)
+            self._publish(number=number, state="copying", pairs=0, said="", started=time.time(), verdict=None)
             self._thread.start()
         return number
 
@@ -82,9 +82,9 @@ class Diagnoses:
     def report(self) -> bytes | None:
         """Return the page of the last diagnosis; None if there is none."""
         number = self._document.report
-        return None if number is None else (self._out(number) / REPORT).read_bytes()
+        return None if number is None else (self._output(number) / REPORT).read_bytes()
 
-    def _out(self, number: int) -> Path:
+    def _output(self, number: int) -> Path:
         return Path(self._folder.name) / str(number)
 
     def _end(self) -> None:
@@ -95,13 +95,13 @@ class Diagnoses:
 
     def _run(self, number: int) -> None:
         try:
-            pairs = self._copy(self._out(number))
-            self._say(state="running", pairs=pairs, said="starting")
-            self._diagnose(self._out(number), number)
+            pairs = self._copy(self._output(number))
+            self._publish(state="running", pairs=pairs, said="starting")
+            self._diagnose(self._output(number), number)
         except Exception as error:
             if not isinstance(error, BodyschemaError):
                 log.exception("a diagnosis failed")
-            self._say(state="stopped" if self._stopping else "failed", said="" if self._stopping else str(error))
+            self._publish(state="stopped" if self._stopping else "failed", said="" if self._stopping else str(error))
 
     def _copy(self, out: Path) -> int:
         out.mkdir()
@@ -139,7 +139,7 @@ class Diagnoses:
         if code != 0:
             raise RecordingError(last.removeprefix("bodyschema: ") or f"ended with code {code}", file=RECORDING)
         file = msgspec.json.decode((out / DIAGNOSIS).read_bytes(), type=DiagnosisFile)
-        self._say(state="done", said=file.sentence, verdict=file.verdict, report=number)
+        self._publish(state="done", said=file.sentence, verdict=file.verdict, report=number)
 
     def _follow(self, child: subprocess.Popen[str]) -> str:
         """Report each step; return the last line of the child's output."""
@@ -149,9 +149,9 @@ class Diagnoses:
             for line in child.stderr:
                 if line.strip():
                     last = line.strip()
-                    self._say(said=last)
+                    self._publish(said=last)
         return last
 
-    def _say(self, **changed: object) -> None:
+    def _publish(self, **changed: object) -> None:
         self._document = msgspec.structs.replace(self._document, **changed)
-        self._tell(self._document)
+        self._on_change(self._document)

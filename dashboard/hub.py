@@ -73,7 +73,7 @@ class Hub:
             return msgspec.json.encode({topic: msgspec.Raw(document) for topic, document in self._documents.items()})
 
     def follow(self) -> Follower:
-        """Return a follower, to be passed to `leave` in the end; it starts with all documents.
+        """Return a follower, to be passed to `unfollow` in the end; it starts with all documents.
 
         Raises:
             HubFullError: too many follow.
@@ -85,7 +85,7 @@ class Hub:
             self._followers.add(follower)
         return follower
 
-    def leave(self, follower: Follower) -> None:
+    def unfollow(self, follower: Follower) -> None:
         with self._lock:
             self._followers.discard(follower)
 

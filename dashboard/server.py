@@ -18,7 +18,7 @@ from .app import application
 from .diagnosing import Diagnoses
 from .hub import Hub
 from .shapes import Body
-from .watch import Watch
+from .watch import ProcessFollower
 
 
 class _Settings:
@@ -56,7 +56,7 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
         hub = Hub()
         with (
             Body(config.robot) as body,
-            Watch(config, hub) as watch,
+            ProcessFollower(config, hub) as watch,
             Diagnoses(
                 config.file, config.robot.joints, watch.history, lambda document: hub.put("diagnosis", document)
             ) as diagnoses,

@@ -106,12 +106,12 @@ class Body:
         except RobotError as error:  # it was there when the page began
             return LinkShapes(said=[f"{error}. Links are shown as rods."])
         if not any(shape.mesh for parts in shapes.values() for shape in parts):
-            return _sent(shapes, {}, [])
+            return _encoded(shapes, {}, [])
         try:
             return msgspec.msgpack.decode(self._run(module_command(MODULE, str(urdf))), type=LinkShapes)
         except (OSError, subprocess.SubprocessError, msgspec.DecodeError) as error:
             log.warning("the meshes of %s: %s", urdf, error)
-            return _sent(shapes, {}, ["The meshes that the URDF names could not be read. Links are shown as rods."])
+            return _encoded(shapes, {}, ["The meshes that the URDF names could not be read. Links are shown as rods."])
 
     def _run(self, command: list[str]) -> bytes:
         """Return a child's output; SubprocessError if it fails, takes too long, or the page ends."""
@@ -138,13 +138,13 @@ def read_shapes(urdf: Path) -> LinkShapes:
     meshes, shapes = MeshSet(urdf, _Settings.most_triangles), link_shapes(parse_urdf(urdf))
     named = [(shape.mesh, shape.sizes) for parts in shapes.values() for shape in parts if shape.kind == "mesh"]
     used = [number for each in named if (number := meshes.number_of(*each)) is not None]
-    drawn, before = meshes.coarser(used)
-    after = sum(len(drawn[number]) for number in used)
-    there = {each: drawn[number] for each in named if (number := meshes.number_of(*each)) is not None}
-    return _sent(shapes, there, list(_sentences(meshes, before, after)))
+    visible, before = meshes.coarser(used)
+    after = sum(len(visible[number]) for number in used)
+    there = {each: visible[number] for each in named if (number := meshes.number_of(*each)) is not None}
+    return _encoded(shapes, there, list(_sentences(meshes, before, after)))
 
 
-def _sent(
+def _encoded(
     shapes: dict[str, list[Shape]], meshes: dict[tuple[str, tuple[float, ...]], FloatArray], said: list[str]
 ) -> LinkShapes:
     """Return shapes without those whose mesh is missing, or has no triangles left, as screws may."""

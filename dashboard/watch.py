@@ -16,7 +16,7 @@ from bodyschema.daemon.transport.keys import CommandName, Keys
 from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
-from bodyschema.dashboard.course import Course, Series, expected_outlook
+from bodyschema.dashboard.course import ChangeHistory, Series, expected_outlook
 from bodyschema.dashboard.documents import Process, ProcessDocument, RobotDocument
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.recent import RecentPairs, RecentSettings, cloud
@@ -38,7 +38,7 @@ class _Settings:
 S = TypeVar("S", SamplerStatus, LearnerStatus)
 
 
-class Heard(Generic[S]):
+class LatestStatus(Generic[S]):
     """Newest status of one process; any thread may use it."""
 
     def __init__(self, kind: type[S], endpoint: str, clock: Clock) -> None:
@@ -61,7 +61,7 @@ class Heard(Generic[S]):
     def answers(self) -> bool:
         """True if the process is alive now."""
         with self._lock:
-            return self._is_there()
+            return self._is_alive()
 
     def take(self, payload: bytes, utc: float) -> None:
         """Store a published status, received at this time [s since 1970]."""
@@ -83,9 +83,9 @@ class Heard(Generic[S]):
     def document(self) -> ProcessDocument:
         """State for the page."""
         with self._lock:
-            return ProcessDocument(self._is_there(), self._endpoint, self._heard_utc, self._problem, self._fields)
+            return ProcessDocument(self._is_alive(), self._endpoint, self._heard_utc, self._problem, self._fields)
 
-    def _is_there(self) -> bool:
+    def _is_alive(self) -> bool:
         recent = self._heard_at is not None and self._clock.now() - self._heard_at < _Settings.silent_after_s
         return self._alive and recent
 
@@ -93,7 +93,7 @@ class Heard(Generic[S]):
 log = logging.getLogger(__name__)
 
 
-class Watch:
+class ProcessFollower:
     """Follower of both processes within a with statement; they may come and go."""
 
     def __init__(self, config: Config, hub: Hub) -> None:
@@ -102,17 +102,17 @@ class Watch:
         self._clock = SystemClock()
         self._keys = Keys(config.robot.name)
         routes: dict[Process, Route] = {"sampler": config.route("sampler"), "learner": config.route("learner")}
-        self._sampler = Heard(SamplerStatus, str(routes["sampler"]), self._clock)
-        self._learner = Heard(LearnerStatus, str(routes["learner"]), self._clock)
+        self._sampler = LatestStatus(SamplerStatus, str(routes["sampler"]), self._clock)
+        self._learner = LatestStatus(LearnerStatus, str(routes["learner"]), self._clock)
         self._sessions = {process: ZenohSession(connect=route) for process, route in routes.items()}
-        self._series, self._course = Series(), Course()
+        self._series, self._course = Series(), ChangeHistory()
         self._recent = RecentPairs()
         self._history: History | None = None
         self._store: str | None = None
         self._predicted: tuple[int, PredictReply] | None = None
         self._picture: tuple[float, bytes] | None = None
         self._picturing = threading.Lock()
-        self._cloud_of: tuple[str, int] | None = None
+        self._cloud_version: tuple[str, int] | None = None
         self._cloud_at = -_Settings.cloud_every_s
         self._stopping = threading.Event()
         self._open: ExitStack | None = None
@@ -175,7 +175,7 @@ class Watch:
         robot, joints = self._config.robot, self._config.robot.joints
         slides = tuple(name for name, slides in zip(joints, robot.chain.prismatic, strict=True) if slides)
         self._hub.put("robot", RobotDocument(robot.name, joints, slides, version("bodyschema")))
-        heard_of: dict[Process, Heard[SamplerStatus] | Heard[LearnerStatus]]
+        heard_of: dict[Process, LatestStatus[SamplerStatus] | LatestStatus[LearnerStatus]]
         heard_of = {"sampler": self._sampler, "learner": self._learner}
         for process, heard in heard_of.items():
             session = self._sessions[process]
@@ -264,8 +264,8 @@ class Watch:
     def _renew_cloud(self, status: LearnerStatus) -> None:
         now = self._clock.now()
         of = (status.model, status.last_seq)
-        if of == self._cloud_of or now - self._cloud_at < _Settings.cloud_every_s or status.store != self._store:
+        if of == self._cloud_version or now - self._cloud_at < _Settings.cloud_every_s or status.store != self._store:
             return
         pairs = self._recent.chosen(status.last_seq - status.pairs_since_change, status.last_seq)
         self._hub.put("cloud", cloud(pairs, self._predict))
-        self._cloud_of, self._cloud_at = of, now
+        self._cloud_version, self._cloud_at = of, now

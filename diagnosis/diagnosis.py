@@ -12,38 +12,50 @@ from numpy.typing import NDArray
 
 from bodyschema.diagnosis.assess.explanation import (
     Explanation,
-    changed_by_the_way,
-    cost_of_names,
+    change_by_path,
     explain,
+    naming_cost,
     useful,
-    without_one,
+    without_cause,
 )
 from bodyschema.diagnosis.assess.residual_structure import ResidualStructure, residual_structure
-from bodyschema.diagnosis.assess.rivals import Standing, standings
+from bodyschema.diagnosis.assess.rivals import CauseAssessment, assessments
 from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
-from bodyschema.diagnosis.fit.noise import correlation, wanders
+from bodyschema.diagnosis.fit.net_evidence import WorthSettings
+from bodyschema.diagnosis.fit.noise import correlation, is_autocorrelated
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
-from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.diagnosis.search.drives import with_small_ripples
-from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
+from bodyschema.diagnosis.search.held_out import (
+    Blocks,
+    HeldOutGain,
+    gain_percent,
+    held_out_errors,
+    held_out_gains,
+    is_marker,
+)
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
-from bodyschema.diagnosis.search.scan import Candidate, Scan, moment_again
-from bodyschema.diagnosis.search.search import Search, are_a_description
-from bodyschema.diagnosis.search.together import Tolerated, in_place_of_tolerances, together, tolerated
+from bodyschema.diagnosis.search.scan import Candidate, Scan, refit_moment
+from bodyschema.diagnosis.search.search import Search, are_only_descriptive
+from bodyschema.diagnosis.search.together import (
+    ToleranceEstimate,
+    alternatives_to_tolerances,
+    estimated_tolerances,
+    together,
+)
 from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies
-from bodyschema.diagnosis.unnamed.rattle import Rattle, likelihood, rattle, rattle_beside
+from bodyschema.diagnosis.unnamed.rattle import LooseMarker, likelihood, rattle, rattle_with_refit
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
 from .stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
 
-Told = Callable[[str], None]
+ReportProgress = Callable[[str], None]
 
 
 class DiagnosisSettings:
@@ -51,19 +63,19 @@ class DiagnosisSettings:
 
     Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `same_scale` and `rescaled`, with
     which tolerances are fitted again, change one and three reports; `little` changes a word. The others change nothing
-    there; `most_spent`, `same_noise`, `most_rows` and `run` were tried on three of them alone, none a long one.
+    there; `max_dof_share`, `same_noise`, `most_rows` and `run` were tried on three of them alone, none a long one.
     """
 
     fewest_outliers = 3  # fewer outliers than this are not a finding
-    outliers_named = 15.0  # smallest evidence gain for reporting outliers [nats]
+    min_outlier_evidence = 15.0  # smallest evidence gain for reporting outliers [nats]
     mostly = 0.8  # outliers count as motion-related if they occur on faster rows at least this often
     # Farther off than this, in units of the change by the path between two readings, the path cannot be the reason.
-    by_so_much = 4.0
+    max_model_error_ratio = 4.0
     # Smallest change of the tolerance scales (in logarithms) that triggers a refit, and the maximum of refits.
     same_scale, rescaled = 0.25, 3
     rattled = 2  # fits with the play of a loose marker; the first tells the noise beside it
     little = 0.9  # squares reduced by less than to this share are reduced a little
-    most_spent = 0.9  # the fit absorbs at most this share of the noise
+    max_dof_share = 0.9  # the fit absorbs at most this share of the noise
     same_noise = 0.1  # smallest change of the instrument's noise (in logarithms) that triggers a refit
     # In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
     most_rows, run = 1000, 50
@@ -80,11 +92,11 @@ class Diagnosis:
     aligned: Fit  # fit of the parameters that robot.toml does not know
     geometry: Fit  # fit with all lengths, axes, joint offsets, the tool and the camera's pose free
     extended: Fit  # fit with the causes, the tolerances, and the smooth model of the unnamed causes
-    alone: Fit  # the same without the smooth model
+    without_smooth_model: Fit  # the same without the smooth model
     stored: Fit  # the part of it that is surely better on another recording, which is written to extended.toml
-    tolerated: Tolerated  # sizes of the tolerances
-    standings: tuple[Standing, ...]  # assessment of each cause against its rivals
-    left: ResidualStructure  # residual structure that no effect fits
+    estimated_tolerances: ToleranceEstimate  # sizes of the tolerances
+    assessments: tuple[CauseAssessment, ...]  # assessment of each cause against its rivals
+    unexplained: ResidualStructure  # residual structure that no effect fits
     blocks: Blocks  # blocks of time for held-out errors
     seed: int  # seed of the resampling
     part: Observations | None = None  # the observations used in the search for causes; None for all
@@ -110,22 +122,22 @@ class Diagnosis:
     @cached_property
     def without_model(self) -> FloatArray | None:
         """Held-out distances (n,) [m] with causes and tolerances but no smooth model; None if there is none."""
-        if self.left.model is None or self.left.model.stored is None or self.leaves_out:
+        if self.unexplained.model is None or self.unexplained.model.stored is None or self.leaves_out:
             return None
-        return np.linalg.norm(held_out_errors(self.alone, self.blocks), axis=1)
+        return np.linalg.norm(held_out_errors(self.without_smooth_model, self.blocks), axis=1)
 
     @cached_property
     def modelled(self) -> FloatArray:
         """Change of the predictions (n, 3) [m] by the model of unnamed causes, with everything else refitted."""
-        if self.left.model is None:
+        if self.unexplained.model is None:
             return np.zeros_like(self.extended.predicted)
-        return self.extended.predicted + self.left.model.unstored - self.alone.predicted
+        return self.extended.predicted + self.unexplained.model.unstored - self.without_smooth_model.predicted
 
     def _extended_errors(self, fit: Fit) -> FloatArray:
         """Return measured minus predicted (n, 3) [m] on rows held out from causes and smooth model."""
-        if self.left.model is None:
+        if self.unexplained.model is None:
             return held_out_errors(fit, self.blocks)
-        return fit.observations.x - fit.predicted + self.left.model.unseen
+        return fit.observations.x - fit.predicted + self.unexplained.model.in_sample_change
 
     @cached_property
     def leaves_out(self) -> bool:
@@ -145,40 +157,42 @@ class Diagnosis:
 
     @property
     def outliers(self) -> int:
-        return int(self._off.sum())
+        return int(self._outlier_rows.sum())
 
     @property
-    def _off(self) -> np.ndarray:
-        return ~self.markers & self.extended.observations.trusted & ~self.extended.doubtful()
+    def _outlier_rows(self) -> np.ndarray:
+        return ~self.markers & self.extended.observations.trusted & ~self.extended.unknown_history()
 
     @property
     def outliers_are_found(self) -> bool:
         """Return True if outliers are numerous and large enough to be a finding."""
-        worth = self.extended.noise.log_likelihood - self.extended.without_outliers
-        named = self.outliers >= DiagnosisSettings.fewest_outliers and worth > DiagnosisSettings.outliers_named
-        return named and not self._off_where_fast() and not self._off_by_what_is_inexact()
+        net_evidence = self.extended.noise.log_likelihood - self.extended.without_outliers
+        named = (
+            self.outliers >= DiagnosisSettings.fewest_outliers and net_evidence > DiagnosisSettings.min_outlier_evidence
+        )
+        return named and not self._outliers_where_fast() and not self._outliers_within_model_error()
 
-    def _off_by_what_is_inexact(self) -> bool:
+    def _outliers_within_model_error(self) -> bool:
         """Return True if the outliers are no farther off than roughly known influences can explain.
 
         These are the path between two readings, which was not observed, and unnamed causes.
         """
         fit = self.extended
-        changes = [changed_by_the_way(fit)]
-        if self.left.model is not None:
-            changes.append(self.left.model.explained)
+        changes = [change_by_path(fit)]
+        if self.unexplained.model is not None:
+            changes.append(self.unexplained.model.explained)
         squares = np.square(fit.observations.whitened(np.stack(changes, axis=2))).sum(axis=1).mean(axis=0)
-        off = np.square(fit.residuals[self._off]).sum(axis=1)
-        return bool(np.median(off) < DiagnosisSettings.by_so_much**2 * squares.sum())
+        off = np.square(fit.residuals[self._outlier_rows]).sum(axis=1)
+        return bool(np.median(off) < DiagnosisSettings.max_model_error_ratio**2 * squares.sum())
 
-    def _off_where_fast(self) -> bool:
+    def _outliers_where_fast(self) -> bool:
         """Return True if most outliers are at the fastest rows; the motion is then poorly modelled."""
         motion = self.extended.observations.motion
         steps = np.linalg.norm(motion.moves, axis=1)
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
-        on, off = self.markers, self._off
-        return max(_exceeds(v[off], v[on]) for v in (steps, speed)) > DiagnosisSettings.mostly
+        on, off = self.markers, self._outlier_rows
+        return max(_probability_larger(v[off], v[on]) for v in (steps, speed)) > DiagnosisSettings.mostly
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """Return the reduction of the RMS from aligned to extended [%], with its 95 % interval on new poses."""
@@ -195,8 +209,8 @@ class Diagnosis:
     @cached_property
     def worse_without(self) -> dict[Identity, float]:
         """Held-out sum of squares without each of the causes, divided by that with all."""
-        if self.part is not None and self.left.model is None:
-            fit, blocks = self.sought, Blocks.cut(len(self.part))
+        if self.part is not None and self.unexplained.model is None:
+            fit, blocks = self.search_fit, Blocks.cut(len(self.part))
             whole, fewer = (
                 held_out_errors(fit, blocks),
                 {c: held_out_errors(fit.without(c), blocks) for c in fit.causes},
@@ -210,7 +224,7 @@ class Diagnosis:
 
     @cached_property
     def shares(self) -> Shares:
-        unnamed = None if self.left.model is None else self.left.model.explained
+        unnamed = None if self.unexplained.model is None else self.unexplained.model.explained
         return shares(self.aligned, self.extended, self.markers, unnamed)
 
     @cached_property
@@ -221,48 +235,57 @@ class Diagnosis:
         differences.
         """
         fit, kept = self.extended, self.markers
-        if self.left.model is not None:
+        if self.unexplained.model is not None:
             # Large tolerances moved into the simulation are right to first order only.
-            fit = self.left.model.fit
-        unstored = 0.0 if self.left.model is None else self.left.model.unstored
-        left = fit.observations.x - fit.predicted - unstored
+            fit = self.unexplained.model.fit
+        unstored = 0.0 if self.unexplained.model is None else self.unexplained.model.unstored
+        unexplained = fit.observations.x - fit.predicted - unstored
         motion = fit.observations.motion
-        shared = correlation(np.where(kept[:, None], left, 0.0), motion.begins)
-        shared = shared if self.left.rattle is None and wanders(shared, motion.begins) else 0.0
-        left = left[kept]
+        shared = correlation(np.where(kept[:, None], unexplained, 0.0), motion.begins)
+        shared = shared if self.unexplained.rattle is None and is_autocorrelated(shared, motion.begins) else 0.0
+        unexplained = unexplained[kept]
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)
         # Scale the stated noise to the size of the residuals, corrected for the degrees of freedom of the fit.
-        spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), DiagnosisSettings.most_spent)
-        size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent) * (1.0 - shared)
+        effective_dof = min(
+            fit.background.effective_dof(fit.noise.sigma) / max(unexplained.size, 1), DiagnosisSettings.max_dof_share
+        )
+        size = (
+            np.square(unexplained).sum()
+            / np.trace(stated[kept], axis1=1, axis2=2).sum()
+            / (1.0 - effective_dof)
+            * (1.0 - shared)
+        )
         # The play of a loose marker is not noise.
-        return float(size) * fit.observations.own
+        return float(size) * fit.observations.noise_covariances
 
     @cached_property
     def with_tolerances_alone(self) -> FloatArray | None:
         """Held-out distances (n,) [m] with tolerances and no cause; None if no tolerance is detected."""
-        if not self.causes or not self.tolerated.seen.any():
+        if not self.causes or not self.estimated_tolerances.is_detected.any():
             return None
         return np.linalg.norm(held_out_errors(self.extended.with_causes([]), self.blocks), axis=1)
 
     @cached_property
-    def sought(self) -> Fit:
+    def search_fit(self) -> Fit:
         """The complete fit over the rows used in the search for causes."""
         return self.extended if self.part is None else self.extended.over(self.part)
 
     @cached_property
-    def in_place_of_tolerances(self) -> list[tuple[Effect, float]]:
+    def alternatives_to_tolerances(self) -> list[tuple[Effect, float]]:
         """Possible causes instead of tolerances of several times a workshop's, with probabilities."""
-        return [] if self.left.is_there else in_place_of_tolerances(self.sought, self.hypotheses.effects)
+        return (
+            [] if self.unexplained.is_present else alternatives_to_tolerances(self.search_fit, self.hypotheses.effects)
+        )
 
     @cached_property
-    def rejected(self) -> list[tuple[Candidate, Added]]:
+    def rejected(self) -> list[tuple[Candidate, HeldOutGain]]:
         """Rejected hypotheses, each with its best fit beside the causes."""
         present = {cause.key for cause in self.causes}
-        fit = self.sought
+        fit = self.search_fit
         blocks = self.blocks if self.part is None else Blocks.cut(len(self.part))
         candidates = Scan(fit).candidates(h for h in self.hypotheses.effects if h.key not in present)
-        return list(zip(candidates, added(fit, candidates, blocks), strict=True))
+        return list(zip(candidates, held_out_gains(fit, candidates, blocks), strict=True))
 
 
 def diagnose(
@@ -273,7 +296,7 @@ def diagnose(
     without: Collection[str] = (),
     seed: int = 0,
     blocks: Blocks | None = None,
-    tell: Told = lambda _: None,
+    tell: ReportProgress = lambda _: None,
 ) -> Diagnosis:
     """Find the errors of `simulation` from a recording.
 
@@ -285,41 +308,41 @@ def diagnose(
     """
     observations = Observations.of(recording, simulation)
     hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
-    told = Stages(tell)
-    told.begin(SETS)
-    told(f"{len(hypotheses.effects)} hypotheses")
+    progress = Stages(tell)
+    progress.begin(SETS)
+    progress(f"{len(hypotheses.effects)} hypotheses")
     blocks = blocks or Blocks.cut(len(recording))
-    rows = _part_of(observations.motion.begins)
+    rows = _searched_rows(observations.motion.begins)
     if len(rows) == len(observations):
-        found = _found(observations, simulation, hypotheses.effects, blocks, seed, told)
+        found = _search(observations, simulation, hypotheses.effects, blocks, seed, progress)
     else:
-        part = _found(observations.some(rows), simulation, hypotheses.effects, Blocks.cut(len(rows)), seed, told)
-        told(f"the same in all {len(observations)} rows")
+        part = _search(observations.some(rows), simulation, hypotheses.effects, Blocks.cut(len(rows)), seed, progress)
+        progress(f"the same in all {len(observations)} rows")
         found = part.over(observations, simulation)
     start, explanation, search = found.start, found.explanation, found.search
     if found.loose is not None:
         # If the side depends on the pose, a model of this dependence predicts better.
-        start = aligned(start.observations.whole, simulation)
-    left = found.left(blocks)
-    fit = (explanation.fit if left.model is None else left.model.fit).settled()
-    made = tolerated(fit)
-    if left.model is None and not made.seen.any():
-        fit = fit.untolerated()
+        start = aligned(start.observations.without_history, simulation)
+    unexplained = found.unexplained(blocks)
+    fit = (explanation.fit if unexplained.model is None else unexplained.model.fit).with_tolerances_applied()
+    tolerances = estimated_tolerances(fit)
+    if unexplained.model is None and not tolerances.is_detected.any():
+        fit = fit.without_tolerances()
     return Diagnosis(
         hypotheses=hypotheses,
         nominal=fitted(start.observations, simulation, len(simulation.effects)),
         aligned=start,
         geometry=_geometry(start),
         extended=fit,
-        alone=explanation.fit,
-        stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, left, blocks),
-        tolerated=made,
-        standings=tuple(found.standings),
-        left=left,
+        without_smooth_model=explanation.fit,
+        stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, unexplained, blocks),
+        estimated_tolerances=tolerances,
+        assessments=tuple(found.assessments),
+        unexplained=unexplained,
         blocks=blocks,
         seed=seed,
         part=None if found.part is None else found.part.start.observations,
-        ended_early=search.ended_early or are_a_description(fit.causes),
+        ended_early=search.ended_early or are_only_descriptive(fit.causes),
     )
 
 
@@ -331,12 +354,12 @@ class _SearchResult:
     search: Search
     unnamed: UnnamedFamilies
     explanation: Explanation
-    standings: Sequence[Standing]  # assessment of each cause against its rivals
-    loose: Rattle | None  # play of the marker; None for one that is fixed
+    assessments: Sequence[CauseAssessment]  # assessment of each cause against its rivals
+    loose: LooseMarker | None  # play of the marker; None for one that is fixed
     is_reshaped: bool  # True if the noise has another shape than stated
     part: _SearchResult | None = None  # result for a part of the observations; None if all were searched
 
-    def left(self, blocks: Blocks) -> ResidualStructure:
+    def unexplained(self, blocks: Blocks) -> ResidualStructure:
         # With many rows, all families would take much memory to find nothing new.
         asked = self if self.part is None or self.explanation.unnamed_causes else self.part
         return residual_structure(asked.explanation, asked.unnamed, blocks, self.loose)
@@ -352,19 +375,23 @@ class _SearchResult:
         observations, loose = fit.observations, self.loose
         if self.is_reshaped:
             observations = reshaped(fit) or observations
-        if before.doubtful is not None:
-            observations = observations.without(_left_out(fit))
+        if before.ignored is not None:
+            observations = observations.ignoring(_left_out(fit))
         if loose is not None:
             loose = rattle(fit) or loose
-            observations = observations.with_rattle(loose.ratio, loose.ways_of(fit))
-        fit, stands = fit.to(observations), list(self.standings)
-        for k in range(len(stands)):
-            moment = _moment_anew(fit, fit.causes[k], before.motion.clock) if fit.causes[k].kind.begins else None
+            observations = observations.with_loose_marker(loose.ratio, loose.directions_at(fit))
+        fit, assessed = fit.to(observations), list(self.assessments)
+        for k in range(len(assessed)):
+            moment = (
+                _refit_moment_between(fit, fit.causes[k], before.motion.clock) if fit.causes[k].kind.begins else None
+            )
             if moment is not None:
                 causes = [*fit.causes]
                 causes[k] = moment.effect
-                fit, stands[k] = fit.with_causes(causes), replace(stands[k], itself=moment)
-        again = replace(self, explanation=replace(self.explanation, fit=fit), standings=stands, loose=loose, part=self)
+                fit, assessed[k] = fit.with_causes(causes), replace(assessed[k], hypothesis=moment)
+        again = replace(
+            self, explanation=replace(self.explanation, fit=fit), assessments=assessed, loose=loose, part=self
+        )
         return again.of(observations, simulation)
 
     def of(self, observations: Observations, simulation: Simulation) -> _SearchResult:
@@ -372,11 +399,16 @@ class _SearchResult:
         start = aligned(observations, simulation)
         unnamed, fit = UnnamedFamilies(start), self.explanation.fit.to(observations)
         chosen = unnamed.again(self.explanation.unnamed_causes)
-        apart = unnamed.apart(fit, chosen) if chosen else None
-        return replace(self, start=start, unnamed=unnamed, explanation=replace(self.explanation, fit=fit, apart=apart))
+        discrepancy_fit = unnamed.discrepancy_fit(fit, chosen) if chosen else None
+        return replace(
+            self,
+            start=start,
+            unnamed=unnamed,
+            explanation=replace(self.explanation, fit=fit, discrepancy_fit=discrepancy_fit),
+        )
 
 
-def _part_of(begins: NDArray[np.bool_]) -> IntArray:
+def _searched_rows(begins: NDArray[np.bool_]) -> IntArray:
     """Return the rows in which to search for causes: all, or equal runs that are spread over a long recording.
 
     Each run is the one of its stretch with the fewest breaks: after a break, the side of a joint's backlash is
@@ -396,11 +428,11 @@ def _part_of(begins: NDArray[np.bool_]) -> IntArray:
     return (firsts[:, None] + np.arange(DiagnosisSettings.run)).ravel()
 
 
-def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | None:
+def _refit_moment_between(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | None:
     """Return a cause that begins at a moment with its best moment, which was searched for only at some times (m,)."""
     clock, after = fit.observations.motion.clock, int(np.searchsorted(searched, cause.values[-1]))
     between = (clock > searched[max(after - 1, 0)]) & (clock < searched[min(after, len(searched) - 1)])
-    return moment_again(fit, cause, between)
+    return refit_moment(fit, cause, between)
 
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
@@ -408,30 +440,30 @@ def _left_out(fit: Fit) -> NDArray[np.bool_]:
 
     If they are too many, return only the first ones; the arm is then assumed to go straight from each run to the next.
     """
-    rows = fit.doubtful()
-    return rows if rows.mean() <= DiagnosisSettings.most_doubtful else fit.doubtful_at_first
+    rows = fit.unknown_history()
+    return rows if rows.mean() <= DiagnosisSettings.most_doubtful else fit.unknown_history_at_first
 
 
-def _found(
+def _search(
     observations: Observations,
     simulation: Simulation,
     hypotheses: Sequence[Effect],
     blocks: Blocks,
     seed: int,
-    told: Stages,
+    progress: Stages,
 ) -> _SearchResult:
     """Search for the causes in some observations, and test for unnamed causes."""
     start = aligned(observations, simulation)
-    search = Search(hypotheses, told)
-    begun = start if start.is_exact else together(start, hypotheses, told)
-    told.begin(SEARCH, SETS)
+    search = Search(hypotheses, progress)
+    initial_fit = start if start.is_exact else together(start, hypotheses, progress)
+    progress.begin(SEARCH, SETS)
     # The most probable set gives the noise, and the rows to leave out, before the long search.
-    begun, start = _refitted(begun, start, simulation)
+    initial_fit, start = _refitted(initial_fit, start, simulation)
     unnamed = UnnamedFamilies(start)
-    extended = search.run(begun) if start.is_exact else _searched(begun, search)
+    extended = search.run(initial_fit) if start.is_exact else _searched(initial_fit, search)
     other_shape = None if start.is_exact else reshaped(extended)
     if other_shape is not None and (
-        rattle(extended) or explain(extended, search.path, unnamed, search, told).unnamed_causes
+        rattle(extended) or explain(extended, search.path, unnamed, search, progress).unnamed_causes
     ):
         # The remainder is not only noise.
         other_shape = None
@@ -439,54 +471,59 @@ def _found(
     if again is not extended:
         unnamed = UnnamedFamilies(start)
         extended = _searched(again, search)
-    told.begin(UNNAMED, SEARCH)
-    explanation = explain(extended, search.path, unnamed, search, told)
+    progress.begin(UNNAMED, SEARCH)
+    explanation = explain(extended, search.path, unnamed, search, progress)
     # A loose marker does not slip, and changes of its side may have been named jumps and bumps.
     steady = [cause for cause in extended.causes if cause.kind.stage != "tool" and not cause.kind.begins]
     # Likelihoods can only be compared over the same rows.
-    bare = begun.with_causes([]).to(start.observations)
+    bare = initial_fit.with_causes([]).to(start.observations)
     fits = [start, bare, *([extended.with_causes(steady)] if steady else [])]
     loose = None if start.is_exact else _loose(explanation, fits, search)
     for _ in range(DiagnosisSettings.rattled if loose is not None else 0):
         assert loose is not None
-        told(loose.what)
+        progress(loose.what)
         # Start again: causes may have been named because of the play, and the noise is smaller without it.
         # A loose marker has no offset of its own, and does not slip.
         fixed = [effect for effect in hypotheses if effect.kind.stage != "tool"]
-        search = Search(fixed, told)
-        start = aligned(loose.taken_out_of(start.observations), simulation)
+        search = Search(fixed, progress)
+        start = aligned(loose.removed_from(start.observations), simulation)
         unnamed = UnnamedFamilies(start)
-        extended = search.run(start) if start.is_exact else _searched(together(start, fixed, told), search)
-        explanation = explain(extended, search.path, unnamed, search, told)
+        extended = search.run(start) if start.is_exact else _searched(together(start, fixed, progress), search)
+        explanation = explain(extended, search.path, unnamed, search, progress)
         loose = rattle(extended) or loose
-    explanation = useful(explanation, search, blocks, told)
-    told.begin(RIVALS, UNNAMED)
-    stands = standings(explanation.beside, search, blocks, seed, None if explanation.unnamed_causes else unnamed)
-    while explanation.unnamed_causes and any(standing.probability < 0.5 for standing in stands):
-        weakest = int(np.argmin([standing.probability for standing in stands]))
-        fewer = without_one(explanation, explanation.fit.causes[weakest], unnamed, search)
+    explanation = useful(explanation, search, blocks, progress)
+    progress.begin(RIVALS, UNNAMED)
+    assessed = assessments(explanation.named_fit, search, blocks, seed, None if explanation.unnamed_causes else unnamed)
+    while explanation.unnamed_causes and any(assessment.probability < 0.5 for assessment in assessed):
+        weakest = int(np.argmin([assessment.probability for assessment in assessed]))
+        fewer = without_cause(explanation, explanation.fit.causes[weakest], unnamed, search)
         if not fewer.unnamed_causes:
             break
         explanation = fewer
-        stands = standings(explanation.beside, search, blocks, seed)
-    found = _SearchResult(start, search, unnamed, explanation, stands, loose, other_shape is not None)
+        assessed = assessments(explanation.named_fit, search, blocks, seed)
+    found = _SearchResult(start, search, unnamed, explanation, assessed, loose, other_shape is not None)
     if loose is None:
         return found
     # No simulation predicts the side on which the marker lies.
-    whole = start.observations.without_play(np.zeros_like(start.observations.x)).without(_left_out(explanation.fit))
-    return found.of(whole.with_rattle(loose.ratio, loose.ways), simulation)
+    without_history = start.observations.without_marker_play(np.zeros_like(start.observations.x)).ignoring(
+        _left_out(explanation.fit)
+    )
+    return found.of(without_history.with_loose_marker(loose.ratio, loose.directions), simulation)
 
 
-def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> Rattle | None:
+def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> LooseMarker | None:
     """Return the play of a loose marker if its two sides beside one of the fits are more probable than everything else.
 
     A joint's error can move the marker along one line as well, but then the joints or the path predict its position.
     """
-    beside, found = explanation.beside, [(rattle_beside(fit), cost_of_names(fit.causes, search)) for fit in fits]
-    other = explanation.worth - explanation.counted * beside.log_likelihood + likelihood(beside)
-    worths = [(play.likelihood - names - other, play) for play, names in found if play is not None]
-    worth, play = max(worths, key=lambda one: one[0], default=(-np.inf, None))
-    return play if worth > WorthSettings.named_nats else None
+    named_fit, found = (
+        explanation.named_fit,
+        [(rattle_with_refit(fit), naming_cost(fit.causes, search)) for fit in fits],
+    )
+    other = explanation.net_evidence - explanation.independence * named_fit.log_likelihood + likelihood(named_fit)
+    net_evidences = [(play.likelihood - names - other, play) for play, names in found if play is not None]
+    net_evidence, play = max(net_evidences, key=lambda one: one[0], default=(-np.inf, None))
+    return play if net_evidence > WorthSettings.named_nats else None
 
 
 def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:
@@ -498,67 +535,69 @@ def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations 
     """
     observations = fit.observations
     factor, left_out = instrument_factor(fit), _left_out(fit)
-    before = np.zeros_like(left_out) if observations.doubtful is None else observations.doubtful
+    before = np.zeros_like(left_out) if observations.ignored is None else observations.ignored
     # Other amounts of the same causes change few rows.
     other_rows = (left_out ^ before).sum() > (left_out & before).sum()
     other_noise = abs(np.log(factor / observations.stated_factor)) > DiagnosisSettings.same_noise
     if fit.is_exact or not (other_rows or other_noise or shape is not None):
         return fit, start
-    observations = (shape or observations).with_factor(factor).without(left_out)
-    again = fit.to(observations).tolerating(fit.background.scales or Scales())
+    observations = (shape or observations).with_factor(factor).ignoring(left_out)
+    again = fit.to(observations).with_tolerances(fit.background.scales or Scales())
     return again, aligned(observations, simulation)
 
 
-def _stored(start: Fit, alone: Fit, complete: Fit, left: ResidualStructure, blocks: Blocks) -> Fit:
+def _stored(
+    start: Fit, without_smooth_model: Fit, complete: Fit, unexplained: ResidualStructure, blocks: Blocks
+) -> Fit:
     """Return the content of extended.toml: the complete fit, or the part that is surely better on another recording.
 
     Args:
-        alone: the complete fit without a smooth model.
+        without_smooth_model: the complete fit without a smooth model.
     """
     markers = is_marker(complete)
-    has_model = left.model is not None and left.model.stored is not None
-    largest = alone.settled() if has_model else complete
-    fits = [start.to(start.observations.whole), largest]
+    has_model = unexplained.model is not None and unexplained.model.stored is not None
+    largest = without_smooth_model.with_tolerances_applied() if has_model else complete
+    fits = [start.to(start.observations.without_history), largest]
     if largest.causes and largest.background.scales is not None:
         fits.insert(1, start.with_causes(largest.causes))
     best = stored(fits, markers)
-    if left.model is not None and has_model:
-        return complete if is_better_with(left.model, best, markers, blocks) else best
+    if unexplained.model is not None and has_model:
+        return complete if is_better_with(unexplained.model, best, markers, blocks) else best
     return best
 
 
-def _searched(begun: Fit, search: Search) -> Fit:
+def _searched(initial_fit: Fit, search: Search) -> Fit:
     """Run the search for causes from a fit, and refit with tolerances updated to its findings."""
-    extended = begun
+    extended = initial_fit
     for _ in range(DiagnosisSettings.rescaled):
-        begun = _with_small_ones_tolerated(begun)
-        extended = search.run(begun)
+        initial_fit = _with_small_drive_errors(initial_fit)
+        extended = search.run(initial_fit)
         before = extended.background.scales or Scales()
         # Possibly all causes are unnamed, and inflate the apparent tolerances.
         bare = extended.with_causes([])
-        search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
-        scales = tolerated(extended).scales
+        search.path = [bare.with_tolerances(before.limited_to_workshop), bare, *search.path[1:]]
+        scales = estimated_tolerances(extended).scales
         moved = np.abs(np.log(scales) - np.log(before)).max()
-        is_same = not _small_ones(extended) and moved < DiagnosisSettings.same_scale
+        is_same = not _small_drive_errors(extended) and moved < DiagnosisSettings.same_scale
         if search.ended_early or is_same:
             break
-        begun = extended.tolerating(scales, _small_ones(extended))
+        initial_fit = extended.with_tolerances(scales, _small_drive_errors(extended))
     return extended
 
 
-def _with_small_ones_tolerated(fit: Fit) -> Fit:
+def _with_small_drive_errors(fit: Fit) -> Fit:
     """Refit with those periodic errors of drives as tolerances that are no larger than other drives' errors."""
     fit = with_small_ripples(fit)
-    small = _small_ones(fit)
-    return fit.tolerating(tolerated(fit).scales, small) if small else fit
+    small = _small_drive_errors(fit)
+    return fit.with_tolerances(estimated_tolerances(fit).scales, small) if small else fit
 
 
-def _small_ones(fit: Fit) -> list[Effect]:
+def _small_drive_errors(fit: Fit) -> list[Effect]:
     """Return the causes of a fit that are no larger than its tolerances."""
-    return [cause for cause in fit.causes if fit.background.tolerates(cause)]
+    return [cause for cause in fit.causes if fit.background.is_within_tolerance(cause)]
 
 
-def _exceeds(some: FloatArray, others: FloatArray) -> float:
+def _probability_larger(some: FloatArray, others: FloatArray) -> float:
     """Return the probability that one of `some` is larger than one of `others`; ties count half."""
     ordered = np.sort(others)
     below = np.searchsorted(ordered, some, "left") + np.searchsorted(ordered, some, "right")

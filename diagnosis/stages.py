@@ -35,13 +35,13 @@ class Stages:
         """Report that a stage begins; `before` is the stage that has just ended."""
         self._stage = stage
         self._done = max(self._done, 0.0 if before is None else before.ends)
-        self._say(stage.what)
+        self._report(stage.what)
 
-    def __call__(self, said: str) -> None:
+    def __call__(self, message: str) -> None:
         """Report a step of the current stage."""
         # The number of steps of a stage is unknown: each takes a quarter of what is left of it.
         self._done += max(self._stage.ends - self._done, 0.0) * 0.25
-        self._say(f"{self._stage.what}: {said}")
+        self._report(f"{self._stage.what}: {message}")
 
-    def _say(self, said: str) -> None:
-        self._tell(f"{self._done:.0f} %, {said}")
+    def _report(self, message: str) -> None:
+        self._tell(f"{self._done:.0f} %, {message}")

@@ -137,8 +137,8 @@ def _naming(subject: str, port: str, root: Path) -> Iterator[Check]:
         return
     by_id = [name for name in serial_ports(root) if os.path.realpath(name) == os.path.realpath(port) and name != port]
     if by_id:
-        said = f"{port} may have another name when it is plugged in again"
-        yield Check(subject, "warning", said, f'set port = "{by_id[0]}" in robot.toml')
+        message = f"{port} may have another name when it is plugged in again"
+        yield Check(subject, "warning", message, f'set port = "{by_id[0]}" in robot.toml')
 
 
 def _latency(port: str, root: Path) -> Iterator[Check]:
@@ -148,6 +148,6 @@ def _latency(port: str, root: Path) -> Iterator[Check]:
         latency_ms = int(file.read_text())
     except (OSError, ValueError):
         return
-    said = f"the adapter keeps bytes back for up to {latency_ms} ms"
+    message = f"the adapter keeps bytes back for up to {latency_ms} ms"
     fix = "bodyschema install udev    # then plug the adapter in again"
-    yield warned("latency timer", said, fix, when=latency_ms > CheckSettings.longest_latency_ms)
+    yield warned("latency timer", message, fix, when=latency_ms > CheckSettings.longest_latency_ms)

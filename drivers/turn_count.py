@@ -78,7 +78,7 @@ class TurnCount:
         self._sensors = list(sensors)
         self.counts = [self._nearest(place, ticks) for place, ticks in enumerate(raw)]
 
-    def continued(self, raw: Sequence[int]) -> list[int]:
+    def unwrapped(self, raw: Sequence[int]) -> list[int]:
         """Return `raw` plus the whole turns that bring it nearest to the last kept positions."""
         together = zip(self._sensors, raw, self.counts, strict=True)
         return [nearest_turn(ticks, count, sensor.ticks_per_turn) for sensor, ticks, count in together]

@@ -32,7 +32,7 @@ class SpeedGate:
             slack: additional tolerance of each position [units].
         """
         self._fastest, self._slack = tuple(fastest), tuple(slack)
-        self._believed: tuple[float, tuple[float, ...]] | None = None
+        self._accepted: tuple[float, tuple[float, ...]] | None = None
         self._suspect: tuple[float, tuple[float, ...]] | None = None
         self._agreeing = 0
 
@@ -47,14 +47,14 @@ class SpeedGate:
         Otherwise accept the positions and return None.
         """
         seen = (t, tuple(places))
-        refused = self._implausible(self._believed, seen)
-        if refused is None:
-            self._believed, self._suspect, self._agreeing = seen, None, 0
+        rejected = self._implausible(self._accepted, seen)
+        if rejected is None:
+            self._accepted, self._suspect, self._agreeing = seen, None, 0
             return None
         agrees = self._suspect is not None and self._implausible(self._suspect, seen) is None
         self._agreeing = self._agreeing + 1 if agrees else 1
         self._suspect = seen
-        return refused
+        return rejected
 
     def _implausible(
         self, before: tuple[float, tuple[float, ...]] | None, seen: tuple[float, tuple[float, ...]]

@@ -4,7 +4,7 @@
 """
 
 from bodyschema.effects.corrected import LiveEncoders
-from bodyschema.effects.simulation import Simulated
+from bodyschema.effects.simulation import PipelineRun
 
 from .corrected import corrected_file, write_corrected
 from .effect_type import Effect, EffectType, Identity
@@ -26,8 +26,8 @@ __all__ = [
     "LiveEncoders",
     "Motion",
     "Parameter",
+    "PipelineRun",
     "Residual",
-    "Simulated",
     "Simulation",
     "StoredModel",
     "Unexplained",

@@ -13,7 +13,7 @@ from bodyschema.effects.motion import Motion, transforms
 from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_atomically
 from bodyschema.robot.calibrated import CalibratedGeometry
 from bodyschema.robot.calibrated_files import calibrated_urdf
 from bodyschema.robot.description import RobotDescription
@@ -69,7 +69,7 @@ def write_corrected(simulation: Simulation, folder: Path, heading: str) -> Path 
             file.unlink(missing_ok=True)
             return None
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole({file: calibrated_urdf(simulation.robot, geometry, folder, heading)})
+        write_atomically({file: calibrated_urdf(simulation.robot, geometry, folder, heading)})
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return file

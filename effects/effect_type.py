@@ -62,7 +62,7 @@ class SimulatedArm(Protocol):
 
 
 class SimulationRun(Protocol):
-    """Properties of a run that an effect may use for its derivatives; see `Simulated`."""
+    """Properties of a run that an effect may use for its derivatives; see `PipelineRun`."""
 
     @property
     def simulation(self) -> SimulatedArm: ...
@@ -341,14 +341,14 @@ class Effect:
         if name not in EFFECT_TYPES:
             raise RobotError(f"there is no effect {name!r}", remedy=did_you_mean(name, EFFECT_TYPES))
         kind = EFFECT_TYPES[name]
-        for joint, wanted, what in ((where, kind.at_joint, "where"), (source, kind.takes_source, "source")):
-            if wanted and joint is None:
-                raise RobotError(f"{name} needs a joint: {what} is missing", remedy=f"Name one of {_list(robot)}")
-            if not wanted and joint is not None:
-                raise RobotError(f"{name} has no {what}", remedy=f"Take {what} = {joint!r} out")
+        for joint, required, field_name in ((where, kind.at_joint, "where"), (source, kind.takes_source, "source")):
+            if required and joint is None:
+                raise RobotError(f"{name} needs a joint: {field_name} is missing", remedy=f"Name one of {_list(robot)}")
+            if not required and joint is not None:
+                raise RobotError(f"{name} has no {field_name}", remedy=f"Take {field_name} = {joint!r} out")
             if joint is not None and joint not in robot.joints:
                 raise RobotError(
-                    f"{what} = {joint!r}: no joint of this robot", remedy=did_you_mean(joint, robot.joints)
+                    f"{field_name} = {joint!r}: no joint of this robot", remedy=did_you_mean(joint, robot.joints)
                 )
         if source is not None and source == where:
             raise RobotError(f"{name}: where and source are the same joint", remedy="Name another joint as source")
@@ -401,7 +401,7 @@ class Effect:
         return own if self.free is None else [k for k in own if k in self.free]
 
     @property
-    def told(self) -> list[int]:
+    def described(self) -> list[int]:
         """Indices of the values that describe it: all except amounts that are not free."""
         amounts = self.amounts
         return [k for k, parameter in enumerate(self.parameters) if k in amounts or not parameter.is_amount]
@@ -412,7 +412,7 @@ class Effect:
         return [k for k, parameter in enumerate(self.parameters) if parameter.smooth]
 
     @property
-    def is_possible(self) -> bool:
+    def is_valid(self) -> bool:
         """True if every value that must not be negative is not."""
         return not any(p.never_negative and value < 0.0 for p, value in zip(self.parameters, self.values, strict=True))
 
@@ -428,15 +428,15 @@ class Effect:
         values[self.amounts] = amounts
         return self.with_values(values)
 
-    def freeing(self, free: tuple[int, ...] | None) -> Effect:
+    def with_free_amounts(self, free: tuple[int, ...] | None) -> Effect:
         """Return the same effect with these amounts free (None for all) and the others nominal."""
         freed = replace(self, free=free)
-        fixed = [k for k in range(len(self.values)) if k not in freed.told]
+        fixed = [k for k in range(len(self.values)) if k not in freed.described]
         values = self.values.copy()
         values[fixed] = [self.parameters[k].nominal for k in fixed]
         return freed.with_values(values)
 
-    def one_more(self, ordinal: int) -> Effect:
+    def with_ordinal(self, ordinal: int) -> Effect:
         """Return another effect of the same kind and place, with the same numbers."""
         return replace(self, ordinal=ordinal)
 
@@ -448,22 +448,22 @@ class Effect:
     def table(self) -> dict[str, Any]:
         """Return the effect as a table of `extended.toml`."""
         head = {"effect": self.name, "where": self.where, "source": self.source}
-        numbers = {self.parameters[k].name: float(self.values[k]) for k in self.told}
+        numbers = {self.parameters[k].name: float(self.values[k]) for k in self.described}
         return {key: value for key, value in head.items() if value is not None} | numbers
 
 
 def _values(
     parameters: tuple[Parameter, ...], given: Mapping[str, float] | Sequence[float] | FloatArray | None, name: str
 ) -> FloatArray:
-    start = [p.usual if p.nominal is None else p.nominal for p in parameters]
+    defaults = [p.usual if p.nominal is None else p.nominal for p in parameters]
     if given is None:
-        return frozen_array(start)
+        return frozen_array(defaults)
     if isinstance(given, Mapping):
         names = [p.name for p in parameters]
         for key in given:
             if key not in names:
                 raise RobotError(f"{name} has no number {key!r}", remedy=did_you_mean(key, names))
-        given = [given.get(p.name, at_rest) for p, at_rest in zip(parameters, start, strict=True)]
+        given = [given.get(p.name, default) for p, default in zip(parameters, defaults, strict=True)]
     values = np.asarray(given, dtype=np.float64)
     if values.shape != (len(parameters),):
         raise RobotError(f"{name} has {len(parameters)} numbers, not {values.size}")

@@ -50,7 +50,7 @@ class EncoderEffect(EffectType):
         Args:
             row_readings: number of readings between rows.
         """
-        return _WithoutMemory(self, place, values)
+        return _MemorylessError(self, place, values)
 
     def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         """Return derivatives (n, 3, p) of the measurements by the effect's values."""
@@ -59,7 +59,7 @@ class EncoderEffect(EffectType):
 
 
 @dataclass(frozen=True)
-class _WithoutMemory:
+class _MemorylessError:
     """The error of an effect that depends only on the present reading."""
 
     effect: EncoderEffect
@@ -70,7 +70,7 @@ class _WithoutMemory:
         return float(self.effect.correction(motion, self.place, self.values)[0])
 
 
-class Driven(Protocol):
+class PathElement(Protocol):
     """An element driven reading by reading."""
 
     def begin(self, reading: float, leading: float) -> None:
@@ -81,10 +81,10 @@ class Driven(Protocol):
         ...
 
 
-class LiveDriven:
+class LivePathElement:
     """`scale` times the output of a driven element; the first move determines its initial state."""
 
-    def __init__(self, place: Place, element: Driven, scale: float) -> None:
+    def __init__(self, place: Place, element: PathElement, scale: float) -> None:
         self._joint, self._element, self._scale = place.joint, element, scale
         self._first: float | None = None
         self._moved = False
@@ -99,7 +99,7 @@ class LiveDriven:
         return self._scale * self._element.follow(reading)
 
 
-def carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
+def decaying_sum(added: FloatArray, kept: FloatArray) -> FloatArray:
     """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); the first row keeps nothing."""
     total, kept, back = added.copy(), kept.copy(), 1
     # Doubling: `kept` is the share of a row that remains after `back` rows.

@@ -28,7 +28,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError, RobotError
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_atomically
 from bodyschema.robot.calibrated_files import tables_elsewhere
 from bodyschema.robot.description import FARTHEST_CAMERA_M, LONGEST_TOOL_M, RobotDescription, Vector3
 from bodyschema.robot.limited import read_at_most
@@ -120,8 +120,8 @@ def read_effects(
     for place, entry in enumerate(entries):
         try:
             effect = _effect(robot, entry)
-            effects.append(effect.one_more(sum(other.key == effect.key for other in effects)))
-        except _WrongEntry as wrong:
+            effects.append(effect.with_ordinal(sum(other.key == effect.key for other in effects)))
+        except _InvalidEntry as wrong:
             line = line_in_entry(text, key, place, wrong.key)
             what = f"{'effect' if key == EFFECTS else key} {place + 1}: {wrong.what}"
             raise RobotError(what, file=file, line=line, remedy=wrong.remedy) from None
@@ -190,7 +190,7 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
         if file.exists() and not replace:
             raise ConfigError("is there already", file=file, remedy="Give another folder")
         model = {} if residual is None else {folder / MODEL_FILE: residual.model.to_bytes()}
-        write_whole(model | {file: text.encode()})
+        write_atomically(model | {file: text.encode()})
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return file
@@ -204,7 +204,7 @@ def _unexplained_table(residual: Unexplained) -> dict[str, Any]:
     return table
 
 
-class _WrongEntry(Exception):
+class _InvalidEntry(Exception):
     """Raised for an invalid effect, with the key that is wrong."""
 
     def __init__(self, what: str, key: str | None = None, remedy: str = "") -> None:
@@ -215,28 +215,28 @@ class _WrongEntry(Exception):
 def _effect(robot: RobotDescription, entry: Mapping[str, Any]) -> Effect:
     name, where, source = (_text(entry, key) for key in _HEAD)
     if name is None:
-        raise _WrongEntry("the key effect is missing", remedy=f"Name one of {', '.join(EFFECT_TYPES)}")
+        raise _InvalidEntry("the key effect is missing", remedy=f"Name one of {', '.join(EFFECT_TYPES)}")
     if name not in EFFECT_TYPES:
-        raise _WrongEntry(f"there is no effect {name!r}", "effect", did_you_mean(name, EFFECT_TYPES))
+        raise _InvalidEntry(f"there is no effect {name!r}", "effect", did_you_mean(name, EFFECT_TYPES))
     try:
         resting = Effect.at(robot, name, where, source)
     except RobotError as error:
-        raise _WrongEntry(error.what, _blamed(error.what), error.remedy) from None
+        raise _InvalidEntry(error.what, _invalid_entry(error.what), error.remedy) from None
     names = [p.name for p in resting.parameters]
     for key in entry:
         if key not in (*names, *_HEAD):
-            raise _WrongEntry(f"{name} has no number {key!r}", key, did_you_mean(key, names))
+            raise _InvalidEntry(f"{name} has no number {key!r}", key, did_you_mean(key, names))
     values = [_number(entry, p, resting) for p in resting.parameters]
     amounts = {resting.parameters[k].name for k in resting.all_amounts}
     if amounts.isdisjoint(entry):
-        raise _WrongEntry(f"{name} says of nothing how much", remedy=f"Give {', '.join(names)}")
+        raise _InvalidEntry(f"{name} says of nothing how much", remedy=f"Give {', '.join(names)}")
     try:
         return Effect.at(robot, name, where, source, values)
     except RobotError as error:
-        raise _WrongEntry(error.what, next((n for n in names if n in error.what), None), error.remedy) from None
+        raise _InvalidEntry(error.what, next((n for n in names if n in error.what), None), error.remedy) from None
 
 
-def _blamed(what: str) -> str | None:
+def _invalid_entry(what: str) -> str | None:
     """Return the key that a message about an effect's place refers to."""
     return next((key for key in ("source", "where") if f"{key} " in what or f"no {key}" in what), "where")
 
@@ -244,7 +244,7 @@ def _blamed(what: str) -> str | None:
 def _text(entry: Mapping[str, Any], key: str) -> str | None:
     value = entry.get(key)
     if value is not None and not isinstance(value, str):
-        raise _WrongEntry(f"{key} = {value!r} is no text", key, "Write a name in quotes")
+        raise _InvalidEntry(f"{key} = {value!r} is no text", key, "Write a name in quotes")
     return value
 
 
@@ -252,20 +252,20 @@ def _number(entry: Mapping[str, Any], parameter: Parameter, effect: Effect) -> f
     name, of_camera = parameter.name, isinstance(effect.kind, CameraEffect)
     if name not in entry:
         if parameter.nominal is None:
-            raise _WrongEntry(f"{effect.name}: {name} is missing", remedy="It has no usual value: give it")
+            raise _InvalidEntry(f"{effect.name}: {name} is missing", remedy="It has no usual value: give it")
         return parameter.nominal
     value = entry[name]
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _WrongEntry(f"{name} = {value!r} is no number", name, "Write it like 0.05 or 1e-3, without a unit")
+        raise _InvalidEntry(f"{name} = {value!r} is no number", name, "Write it like 0.05 or 1e-3, without a unit")
     if not abs(value) <= sys.float_info.max:  # an integer of TOML may be larger
-        raise _WrongEntry(f"{name} = {value} is not finite", name)
+        raise _InvalidEntry(f"{name} = {value} is not finite", name)
     if parameter.never_negative and value < 0.0:
-        raise _WrongEntry(f"{name} = {value:g}: it is never negative", name, "Take the minus away, or the effect")
+        raise _InvalidEntry(f"{name} = {value:g}: it is never negative", name, "Take the minus away, or the effect")
     if parameter.below_one and not 0.0 <= value < 1.0:
-        raise _WrongEntry(f"{name} = {value:g} is no share", name, "Give a number from 0 to below 1")
+        raise _InvalidEntry(f"{name} = {value:g} is no share", name, "Give a number from 0 to below 1")
     for ending, largest, unit, remedy in _UNITS:
         if parameter.is_amount and name.endswith(ending):
             if abs(value) > (FARTHEST_CAMERA_M if of_camera and ending == "_m" else largest):
-                raise _WrongEntry(f"{name} = {value:g}: this looks like {unit}", name, remedy)
+                raise _InvalidEntry(f"{name} = {value:g}: this looks like {unit}", name, remedy)
             break
     return float(value)

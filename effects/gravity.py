@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.urdf import REVOLUTE, PointMass, UrdfJoint, UrdfTree, standing
+from bodyschema.robot.urdf import REVOLUTE, PointMass, UrdfJoint, UrdfTree, fixed_transform
 from kbmaps.rotations import cross_matrix
 
 GRAVITY_M_S2 = 9.80665  # down the root link's z axis, as simulators load a URDF
@@ -83,14 +83,14 @@ class GravityLoad:
         robot = self._robot
         return carried(robot.tree, robot.robot.marker_link, robot.joints, robot.robot.held_at)
 
-    def in_supports(self, k: int) -> list[FloatArray]:
+    def in_support_frames(self, k: int) -> list[FloatArray]:
         """Return poses (4, 4) of a joint's frame in the links that carry it rigidly: parent link first, farthest last.
 
         The farthest is the link of the next joint that is read, or the root link. Equal frames are listed once.
         """
         robot = self._robot
         joint, poses = robot.tree.joints[robot.joints[k]], list[FloatArray]()
-        for _, T in _borne(robot.tree, joint.parent, robot.joints, robot.robot.held_at):
+        for _, T in _carried_links(robot.tree, joint.parent, robot.joints, robot.robot.held_at):
             pose = T @ joint.T_parent_joint
             if not poses or not np.allclose(pose, poses[-1]):
                 poses.append(pose)
@@ -179,11 +179,11 @@ def carried(
     tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
 ) -> tuple[int | None, FloatArray]:
     """Return the read joint that carries `link`, None for the base, and the link's pose (4, 4) in its child link."""
-    *_, (joint, T) = _borne(tree, link, joints, held_at)
+    *_, (joint, T) = _carried_links(tree, link, joints, held_at)
     return None if joint is None else joints.index(joint.name), T
 
 
-def _borne(
+def _carried_links(
     tree: UrdfTree, link: str, joints: tuple[str, ...], held_at: dict[str, float]
 ) -> Iterator[tuple[UrdfJoint | None, FloatArray]]:
     """Yield the joint above `link` and the link's pose (4, 4) in itself, then the same for each link that bears it.
@@ -198,7 +198,7 @@ def _borne(
         yield joint, T
         if joint is None or joint.name not in unread:
             return
-        T = standing(joint, False, held_at.get(joint.name, 0.0)) @ T
+        T = fixed_transform(joint, False, held_at.get(joint.name, 0.0)) @ T
         link = joint.parent
 
 

@@ -11,7 +11,7 @@ from .effect_type import Effect
 from .motion import Motion
 
 
-def settled(motion: Motion, time_constant_s: float) -> FloatArray:
+def drift_share(motion: Motion, time_constant_s: float) -> FloatArray:
     """Return the fraction of a drift that has developed (n,), from 0 at the start of the motion towards 1."""
     return -np.expm1(-(motion.clock - motion.began) / time_constant_s)
 

@@ -125,29 +125,29 @@ class Motion:
         if self.t is None:
             return self
         if isinstance(lag_s, np.ndarray):
-            return _asked(self, self.t - lag_s)
-        return self if lag_s == 0.0 else _earlier(self, lag_s)
+            return _resampled(self, self.t - lag_s)
+        return self if lag_s == 0.0 else _delayed(self, lag_s)
 
 
 @lru_cache(maxsize=16)
-def _earlier(motion: Motion, lag_s: float) -> Motion:
+def _delayed(motion: Motion, lag_s: float) -> Motion:
     """Return the earlier readings; cached, since a search repeats the same lags."""
     assert motion.t is not None
-    return _asked(motion, motion.t - lag_s)
+    return _resampled(motion, motion.t - lag_s)
 
 
-def _asked(motion: Motion, asked: FloatArray) -> Motion:
-    """Return the readings at the times `asked` (n,), each from the run of its row."""
+def _resampled(motion: Motion, times: FloatArray) -> Motion:
+    """Return the readings at the times `times` (n,), each from the run of its row."""
     assert motion.t is not None
     t, cubics = motion.t, motion.cubics
     lengths = [end - first for first, end in motion.runs]
     first, end = (np.repeat(rows, lengths) for rows in zip(*motion.runs, strict=True))
-    inside = np.clip(asked, t[first], t[end - 1])
+    inside = np.clip(times, t[first], t[end - 1])
     interval = np.clip(np.searchsorted(t, inside, side="right") - 1, first, np.maximum(end - 2, first))
     since = (inside - t[interval])[:, None]
     a, b, c, d = cubics[:, interval]
     rate = (3.0 * a * since + 2.0 * b) * since + c
-    q = ((a * since + b) * since + c) * since + d + (asked - inside)[:, None] * rate
+    q = ((a * since + b) * since + c) * since + d + (times - inside)[:, None] * rate
     return Motion(frozen_array(q), motion.t, motion.segment, motion.begun_at)
 
 
@@ -163,10 +163,12 @@ def _cubics(t: FloatArray, q: FloatArray) -> FloatArray:
     if len(gaps) == 1:
         rates[:] = slopes
     else:
-        one, other = 2.0 * gaps[1:] + gaps[:-1], gaps[1:] + 2.0 * gaps[:-1]
-        onward = slopes[:-1] * slopes[1:] > 0.0
-        before, after = (np.where(onward, part, 1.0) for part in (slopes[:-1], slopes[1:]))
-        rates[1:-1] = np.where(onward, (one + other) / (one / before + other / after), 0.0)
+        weight_before, weight_after = 2.0 * gaps[1:] + gaps[:-1], gaps[1:] + 2.0 * gaps[:-1]
+        same_sign = slopes[:-1] * slopes[1:] > 0.0
+        before, after = (np.where(same_sign, part, 1.0) for part in (slopes[:-1], slopes[1:]))
+        rates[1:-1] = np.where(
+            same_sign, (weight_before + weight_after) / (weight_before / before + weight_after / after), 0.0
+        )
         for end, inner in ((0, 1), (-1, -2)):
             slope, next_one = slopes[end], slopes[inner]
             rate = ((2.0 * gaps[end] + gaps[inner]) * slope - gaps[end] * next_one) / (gaps[end] + gaps[inner])

@@ -51,7 +51,7 @@ _RESIDUALS: WeakKeyDictionary[Motion, WeakKeyDictionary[Residual, FloatArray]] =
 Staged = TypeVar("Staged", bound=EffectType)
 
 
-class _Beneath(NamedTuple):
+class _BackgroundResult(NamedTuple):
     """The chain, and joint angles (n, d) from the readings, with the background as the only effects."""
 
     chain: RigidChain
@@ -101,10 +101,10 @@ class Simulation:
     @cached_property
     def rigid(self) -> Simulation:
         """The simulation with only the effects that a rigid chain can hold, and without the residual."""
-        own, background = (
+        kept_effects, background = (
             tuple(effect for effect in effects if effect.kind.rigid) for effects in (self.effects, self.background)
         )
-        rigid = Simulation(self.robot, own, None, background)
+        rigid = Simulation(self.robot, kept_effects, None, background)
         rigid.__dict__["gravity"] = self.gravity
         return rigid
 
@@ -114,11 +114,11 @@ class Simulation:
 
         Jumps, slips and bumps stay; effects of motion or of warming up are removed.
         """
-        stayed = self.after_moments
-        return replace(stayed, effects=tuple(effect for effect in stayed.effects if not effect.kind.is_transient))
+        permanent = self.with_permanent_changes
+        return replace(permanent, effects=tuple(effect for effect in permanent.effects if not effect.kind.is_transient))
 
     @property
-    def after_moments(self) -> Simulation:
+    def with_permanent_changes(self) -> Simulation:
         """The same simulation with jumps, slips and bumps made permanent."""
         own = [effect for effect in self.effects if effect.kind.stays_as is None]
         later = [
@@ -148,7 +148,7 @@ class Simulation:
         effects = tuple(effect for effect in self.effects if not effect.kind.is_free(robot))
         return replace(self, robot=robot.with_placement(pose, marker), effects=effects)
 
-    def having(self, effect: Effect) -> Simulation:
+    def with_effect(self, effect: Effect) -> Simulation:
         """Return the same simulation with an effect added, or replaced by identity."""
         own, background = (
             tuple(effect if one.identity == effect.identity else one for one in effects)
@@ -162,22 +162,22 @@ class Simulation:
         """Return the simulated measurements (n, 3) [m] in the measurement frame."""
         return self.run(motion).measured
 
-    def run(self, motion: Motion) -> Simulated:
+    def run(self, motion: Motion) -> PipelineRun:
         """Run the pipeline, keeping all intermediate results."""
         readings = motion.earlier(self.latency_s)
         q = self.unloaded(readings)
-        q += self.given_way(q)
+        q += self.deflections(q)
         chain = self._chain()
         frames = chain.frames(q)
         marker = frames[:, -1]
         x_true = marker[:, :3, 3] + np.einsum("nij,nj->ni", marker[:, :3, :3], self.tool_shift(motion))
         x_placed = (x_true - self.camera_pose[:3, 3]) @ self.camera_pose[:3, :3]
         x_camera = x_placed
-        if any(effect.kind.begins for effect, _ in self._of(CameraEffect)):
+        if any(effect.kind.begins for effect, _ in self._effects_of(CameraEffect)):
             T_placed_camera = self.camera_moves(motion)
             x_camera = np.einsum("nji,nj->ni", T_placed_camera[:, :3, :3], x_placed - T_placed_camera[:, :3, 3])
         measured = self.reported(x_camera, motion) + self.added(motion)
-        return Simulated(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
+        return PipelineRun(self, motion, readings, q, chain, frames, x_true, x_placed, x_camera, measured)
 
     def unloaded(self, readings: Motion) -> FloatArray:
         """Return true joint angles (n, d) [rad, m] without deflection under weight."""
@@ -198,9 +198,9 @@ class Simulation:
         return q
 
     @cached_property
-    def _beneath(self) -> _Beneath:
+    def _beneath(self) -> _BackgroundResult:
         """The result of the background alone, which is the same with other effects."""
-        return _Beneath(self._bent(self.robot.chain, self.background), WeakKeyDictionary())
+        return _BackgroundResult(self._with_link_corrections(self.robot.chain, self.background), WeakKeyDictionary())
 
     def place(self, effect: Effect) -> Place:
         """Return the place of an effect of the first stage."""
@@ -218,7 +218,7 @@ class Simulation:
 
     def altered(self, x: FloatArray, motion: Motion) -> FloatArray:
         """Return the reported positions (n, 3) [m] of points x (n, 3), altered by effects beyond the optics."""
-        for effect, kind in self._of(CameraEffect):
+        for effect, kind in self._effects_of(CameraEffect):
             if kind.alters_report:
                 x = kind.reported(x, motion, effect.values, self.robot.calibration)
         return x
@@ -226,23 +226,25 @@ class Simulation:
     @cached_property
     def alters_report(self) -> bool:
         """True if an effect beyond the optics alters the camera's report."""
-        return any(kind.alters_report for _, kind in self._of(CameraEffect))
+        return any(kind.alters_report for _, kind in self._effects_of(CameraEffect))
 
     @cached_property
     def optics(self) -> Optics:
-        parts = [kind.optics(effect.values) for effect, kind in self._of(CameraEffect)]
+        parts = [kind.optics(effect.values) for effect, kind in self._effects_of(CameraEffect)]
         return sum((part for part in parts if part is not None), Optics())
 
     @property
     def latency_s(self) -> float:
         """Delay of the images' timestamps [s]."""
-        return sum(kind.delay_s(effect.values) for effect, kind in self._of(TimeEffect))
+        return sum(kind.delay_s(effect.values) for effect, kind in self._effects_of(TimeEffect))
 
-    def _of(self, stage: type[Staged]) -> list[tuple[Effect, Staged]]:
-        return [(effect, effect.kind) for effect in self._staged[stage.stage] if isinstance(effect.kind, stage)]
+    def _effects_of(self, stage: type[Staged]) -> list[tuple[Effect, Staged]]:
+        return [
+            (effect, effect.kind) for effect in self._effects_by_stage[stage.stage] if isinstance(effect.kind, stage)
+        ]
 
     @cached_property
-    def _staged(self) -> dict[Stage, list[Effect]]:
+    def _effects_by_stage(self) -> dict[Stage, list[Effect]]:
         staged: dict[Stage, list[Effect]] = {stage: [] for stage in STAGES}
         for effect in self.all_effects:
             staged[effect.kind.stage].append(effect)
@@ -258,32 +260,32 @@ class Simulation:
         """True if the weight may matter: the joints bear it, or the URDF states it and its supports may deflect."""
         return self.bears_weight or self.gravity.known
 
-    def given_way(self, q: FloatArray, hung: dict[Identity, float] | None = None) -> FloatArray:
+    def deflections(self, q: FloatArray, flanks: dict[Identity, float] | None = None) -> FloatArray:
         """Return the joints' deflection under the arm's weight (n, d) [rad, m], their springs unloaded at q (n, d).
 
         Args:
-            hung: flank of each loaded backlash before the first row, updated to the last; None if unknown.
+            flanks: flank of each loaded backlash before the first row, updated to the last; None if unknown.
         """
-        given = np.zeros_like(q)
+        deflection = np.zeros_like(q)
         if not self.bears_weight:
-            return given
+            return deflection
         if self.springs.any():
             for _ in range(SimulationSettings.spring_rounds):
-                given = self.springs * self.torques(q + given)
-        loose = [(effect, kind) for effect, kind in self._of(StructureEffect) if kind.has_slack]
-        torques, sides = self.torques(q + given) if loose else given, {} if hung is None else hung
+                deflection = self.springs * self.torques(q + deflection)
+        loose = [(effect, kind) for effect, kind in self._effects_of(StructureEffect) if kind.has_slack]
+        torques, sides = self.torques(q + deflection) if loose else deflection, {} if flanks is None else flanks
         for effect, kind in loose:
             k = self.place(effect).joint
             slack, side = kind.slack(torques[:, k], effect.values, sides.get(effect.identity, 0.0))
-            given[:, k] += slack
+            deflection[:, k] += slack
             sides[effect.identity] = side
-        return given
+        return deflection
 
     @cached_property
     def springs(self) -> FloatArray:
         """Compliance of each joint (d,) [rad/(N·m), m/N]."""
         springs = np.zeros(len(self.robot.joints))
-        for effect, kind in self._of(StructureEffect):
+        for effect, kind in self._effects_of(StructureEffect):
             if effect.where is not None:
                 springs[self.place(effect).joint] += kind.compliance(effect.values)
         return springs
@@ -294,7 +296,7 @@ class Simulation:
 
     @cached_property
     def payloads(self) -> list[GravityLoad]:
-        loads = [kind.load(self.gravity, effect.values) for effect, kind in self._of(StructureEffect)]
+        loads = [kind.load(self.gravity, effect.values) for effect, kind in self._effects_of(StructureEffect)]
         return [load for load in loads if load is not None]
 
     @property
@@ -319,9 +321,9 @@ class Simulation:
         return transforms(np.concatenate([along, none] if chain.prismatic[joint] else [none, along])[None])[0]
 
     def _chain(self) -> RigidChain:
-        return self._bent(self._beneath.chain, self.effects)
+        return self._with_link_corrections(self._beneath.chain, self.effects)
 
-    def _bent(self, chain: RigidChain, effects: Sequence[Effect]) -> RigidChain:
+    def _with_link_corrections(self, chain: RigidChain, effects: Sequence[Effect]) -> RigidChain:
         """Return a chain with the corrections of its links by some effects."""
         moves = self._link_moves(effects)
         if not moves:
@@ -345,14 +347,14 @@ class Simulation:
     @cached_property
     def upward(self) -> list[bool]:
         """True for joints passed from child to parent on the path from camera to marker (d,)."""
-        way = self.robot.tree.path(self.robot.camera.parent_link, self.robot.robot.marker_link)
-        upward = {joint.name: passed_upward for joint, passed_upward in way}
+        path = self.robot.tree.path(self.robot.camera.parent_link, self.robot.robot.marker_link)
+        upward = {joint.name: is_upward for joint, is_upward in path}
         return [upward[name] for name in upward if name in self.robot.joints]
 
     def tool_shift(self, motion: Motion) -> FloatArray:
         """Return the displacement of the marker from its nominal position (n, 3) [m], in its link."""
         shift = np.zeros((len(motion), 3))
-        for effect, kind in self._of(ToolEffect):
+        for effect, kind in self._effects_of(ToolEffect):
             shift[after(motion, effect) if kind.begins else slice(None)] += kind.shift(effect.values)
         return shift
 
@@ -360,7 +362,7 @@ class Simulation:
     def camera_pose(self) -> FloatArray:
         """Initial camera pose (4, 4), in the frame that the description gives it."""
         T = np.eye(4)
-        for effect, kind in self._of(CameraEffect):
+        for effect, kind in self._effects_of(CameraEffect):
             if not kind.begins and (pose := effect.pose) is not None:
                 T = T @ pose
         return T
@@ -368,7 +370,7 @@ class Simulation:
     def camera_moves(self, motion: Motion) -> FloatArray:
         """Return the camera's pose (n, 4, 4) in its initial frame."""
         T = np.tile(np.eye(4), (len(motion), 1, 1))
-        for effect, kind in self._of(CameraEffect):
+        for effect, kind in self._effects_of(CameraEffect):
             if kind.begins and (pose := effect.pose) is not None:
                 T[after(motion, effect)] @= pose
         return T
@@ -381,7 +383,7 @@ class Simulation:
             if self.residual not in known:
                 known[self.residual] = self.residual.predict(motion.q)
             shift = known[self.residual]
-        for effect, kind in self._of(TimeEffect):
+        for effect, kind in self._effects_of(TimeEffect):
             drift = kind.drift(motion, effect.values)
             if drift is not None:
                 shift = shift + drift
@@ -389,7 +391,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class Simulated:
+class PipelineRun:
     """One run of the pipeline, with its derivatives by each effect's parameters."""
 
     simulation: Simulation
@@ -465,7 +467,7 @@ class Simulated:
         for k in effect.all_amounts:
             step = np.zeros(len(effect.values))
             step[k] = EffectSettings.step
-            ends = (self.simulation.having(effect.with_values(effect.values + s * step)) for s in (1.0, -1.0))
+            ends = (self.simulation.with_effect(effect.with_values(effect.values + s * step)) for s in (1.0, -1.0))
             more, less = (simulation.reported(self.x_camera, self.motion) for simulation in ends)
             columns[:, :, k] = (more - less) / (2.0 * EffectSettings.step)
         return columns

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from bodyschema.calibration.comparison import Distances, laid_on
+from bodyschema.calibration.comparison import Distances, aligned_to
 from bodyschema.cli.terminal.screen import mm
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import JointRange
@@ -54,7 +54,7 @@ class Model:
     calibration: ChainCalibration | None  # its calibration; None without one
 
 
-class Odd(msgspec.Struct, frozen=True):
+class OutlyingFigure(msgspec.Struct, frozen=True):
     """Figure of a robot that differs from the others' by more than its uncertainty and their spread."""
 
     figure: str  # in words, as in `zero of elbow`
@@ -72,7 +72,7 @@ class Unit(msgspec.Struct, frozen=True, kw_only=True):
     claimed_mm: float  # predicted error of its learner at the poses, root mean square
     in_support: float  # share of the poses that lie where it has data
     is_off: bool | None  # true if it is an outlier; null if there are too few robots to decide
-    odd: tuple[Odd, ...]  # its figures that stand out, the most improbable first
+    odd: tuple[OutlyingFigure, ...]  # its figures that stand out, the most improbable first
     # camera_moved_mm, camera_turned_deg: from the camera pose in its robot.toml
     camera_moved_mm: float | None
     camera_turned_deg: float | None
@@ -104,15 +104,15 @@ def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[st
     return np.random.default_rng(0).uniform(low, high, (_Settings.poses, len(joints)))
 
 
-def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
+def compare_models(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
     """Compare the models of at least two robots, at the poses q (n, d)."""
     middle = median_model([model.x for model in models])
-    apart = [Distances.of(laid_on(middle, model.x)[0] - middle) for model in models]
+    apart = [Distances.of(aligned_to(middle, model.x)[0] - middle) for model in models]
     typical = float(np.median([each.rms_mm for each in apart]))
     claimed = float(np.median([1e3 * model.sigma_m for model in models]))
     figures = _figures(models)
-    judged = len(models) >= _Settings.fewest_to_judge
-    odd = [_odd(k, figures) if judged else () for k in range(len(models))]
+    can_judge = len(models) >= _Settings.fewest_to_judge
+    odd = [_outlying_figures(k, figures) if can_judge else () for k in range(len(models))]
     far = [_Settings.far * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
     units = tuple(
         Unit(
@@ -120,13 +120,13 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
             apart=each,
             claimed_mm=1e3 * model.sigma_m,
             in_support=model.in_support,
-            is_off=bool(odd[k]) or each.rms_mm > far[k] if judged else None,
+            is_off=bool(odd[k]) or each.rms_mm > far[k] if can_judge else None,
             odd=odd[k],
             camera_moved_mm=moved[0],
             camera_turned_deg=moved[1],
         )
         for k, (model, each) in enumerate(zip(models, apart, strict=True))
-        for moved in [_camera_moved(model.calibration)]
+        for moved in [_camera_displacement(model.calibration)]
     )
     low, high = (tuple(map(float, ends)) for ends in (q.min(axis=0), q.max(axis=0)))
     return TypeComparison(joints, len(q), low, high, units)
@@ -139,11 +139,11 @@ def median_model(positions: Sequence[FloatArray]) -> FloatArray:
     """
 
     def distance(x: FloatArray) -> float:
-        return float(np.median([np.linalg.norm(laid_on(x, other)[0] - x) for other in positions]))
+        return float(np.median([np.linalg.norm(aligned_to(x, other)[0] - x) for other in positions]))
 
     middle = min(positions, key=distance)
     for _ in range(_Settings.rounds):
-        middle = np.median([laid_on(middle, x)[0] for x in positions], axis=0)
+        middle = np.median([aligned_to(middle, x)[0] for x in positions], axis=0)
     return middle
 
 
@@ -158,18 +158,18 @@ class _Figure:
 
 
 def _figures(models: Sequence[Model]) -> list[_Figure]:
-    told: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
+    by_figure: dict[tuple[str, str], dict[int, tuple[float, float]]] = {}
     for k, model in enumerate(models):
         found = model.calibration
         if found is None:
             continue
         for joint, zero in found.zeros.items():
             if zero is not None:
-                told.setdefault((f"zero of {joint}", "rad"), {})[k] = zero.value, zero.half_width
+                by_figure.setdefault((f"zero of {joint}", "rad"), {})[k] = zero.value, zero.half_width
         for axis, figure in zip("xyz", found.marker_xyz, strict=True):
-            told.setdefault((f"tool in {axis}", "m"), {})[k] = figure.learnt, figure.half_width
+            by_figure.setdefault((f"tool in {axis}", "m"), {})[k] = figure.learnt, figure.half_width
     figures = []
-    for (name, unit), of_robots in told.items():
+    for (name, unit), of_robots in by_figure.items():
         numbers = np.full((2, len(models)), np.nan)
         for k, (value, half_width) in of_robots.items():
             numbers[:, k] = value, half_width
@@ -178,27 +178,27 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
     return figures
 
 
-def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
+def _outlying_figures(robot: int, figures: Sequence[_Figure]) -> tuple[OutlyingFigure, ...]:
     tried = sum(int(np.isfinite(figure.values).sum()) for figure in figures)
-    found: list[tuple[float, Odd]] = []
+    found: list[tuple[float, OutlyingFigure]] = []
     for figure in figures:
         own, others = figure.half_widths[robot], figure.half_widths[np.isfinite(figure.half_widths)]
         difference = float(figure.values[robot] - np.nanmedian(figure.values))
         half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
-        possible = math.hypot(half_width, _quantile(0.975) * _spread(figure.values))
-        far = abs(difference) / possible if possible > 0.0 else 0.0
+        expected_spread = math.hypot(half_width, _quantile(0.975) * _spread(figure.values))
+        far = abs(difference) / expected_spread if expected_spread > 0.0 else 0.0
         if far > _quantile(1.0 - 0.5 * _Settings.chance / tried) / _quantile(0.975):
-            found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
+            found.append((far, OutlyingFigure(figure.name, difference, half_width, figure.unit)))
     return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
 
 
 def _spread(values: FloatArray) -> float:
     """Return the robust 1-sigma of a figure among robots, from the median of their distances to the median."""
-    told = values[np.isfinite(values)]
-    return float(np.median(np.abs(told - np.median(told))) / _quantile(0.75))
+    finite = values[np.isfinite(values)]
+    return float(np.median(np.abs(finite - np.median(finite))) / _quantile(0.75))
 
 
-def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
+def _camera_displacement(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
     """Return the distance [mm] and the rotation [°] from the camera pose in robot.toml."""
     if found is None:
         return None, None
@@ -243,7 +243,7 @@ def compare_types(fleet: Fleet, members: Sequence[Member]) -> tuple[list[TypeCom
         if len(models) < 2:
             left_out += [f"{model.robot}: there is no other of its type" for model in models]
             continue
-        found.append(compared(joints, q, models))
+        found.append(compare_models(joints, q, models))
     return found, left_out
 
 
@@ -251,13 +251,13 @@ def _model(fleet: Fleet, robot: Member, q: FloatArray) -> Model:
     if robot.route is None:
         raise BusError("its learner was not found")
     payload = fleet.bus(robot.route).ask_one(Keys(robot.name).predict, encode({"q": q.tolist()}))
-    said = decode(payload, PredictReply)
-    x, sigma = np.array(said.x), np.array(said.sigma)
+    reply = decode(payload, PredictReply)
+    x, sigma = np.array(reply.x), np.array(reply.sigma)
     if x.shape != (len(q), 3) or sigma.shape != x.shape or not np.isfinite(x).all():
         raise RequestError("its learner's predictions are not one position a pose")
     calibration = None if robot.learner is None else robot.learner.calibration
     distance = float(np.sqrt(np.square(sigma).sum(axis=1).mean()))
-    return Model(robot.name, x, distance, float(np.mean(said.in_support)), calibration)
+    return Model(robot.name, x, distance, float(np.mean(reply.in_support)), calibration)
 
 
 def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> RenderableType:
@@ -270,23 +270,23 @@ def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> Rend
 
 def sentences(comparison: TypeComparison) -> list[str]:
     units = comparison.units
-    said = [
+    lines = [
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "
         "model laid on their median as a whole."
     ]
     if len(units) < _Settings.fewest_to_judge:
-        return [*said, "Of two robots, it is not possible to say which is the odd one."]
+        return [*lines, "Of two robots, it is not possible to say which is the odd one."]
     off = [unit for unit in units if unit.is_off]
     if not off:
-        said.append("None is farther from the others than the models claim to be wrong, and no figure stands out.")
+        lines.append("None is farther from the others than the models claim to be wrong, and no figure stands out.")
     for unit in off:
-        why = [figure_told(odd) for odd in unit.odd[:3]]
-        told = f": {'; '.join(why)}" if why else "; none of its figures stands out alone"
-        said.append(f"{unit.robot} is off by {mm(unit.apart.rms_mm / 1e3)} (RMS){told}.")
-    return said
+        why = [format_figure(odd) for odd in unit.odd[:3]]
+        reason = f": {'; '.join(why)}" if why else "; none of its figures stands out alone"
+        lines.append(f"{unit.robot} is off by {mm(unit.apart.rms_mm / 1e3)} (RMS){reason}.")
+    return lines
 
 
-def figure_told(odd: Odd) -> str:
+def format_figure(odd: OutlyingFigure) -> str:
     """Return an outlying figure as text, such as `zero of elbow +2.1 ± 0.2°`."""
     factor, unit = (math.degrees(1.0), "°") if odd.unit == "rad" else (1e3, " mm")
     half = factor * odd.half_width
@@ -313,6 +313,6 @@ def _table(units: Sequence[Unit]) -> Table:
             mm(unit.claimed_mm / 1e3),
             f"{unit.in_support:.0%}",
             moved,
-            "\n".join(map(figure_told, unit.odd)) or "-",
+            "\n".join(map(format_figure, unit.odd)) or "-",
         )
     return table

@@ -20,7 +20,7 @@ import msgspec
 
 from bodyschema.cli.commands.options import robot_file
 from bodyschema.cli.recordings.diagnosis import (
-    Asked,
+    DiagnosisSettings,
     ReportedDiagnosis,
     Source,
     measured,
@@ -110,19 +110,24 @@ class _Read:
     source: Source
 
 
-Told = Callable[[str, str], None]
-Done = Callable[[Diagnosed], None]
+ReportProgress = Callable[[str, str], None]
+ReportResult = Callable[[Diagnosed], None]
 
 
 def diagnose_all(
-    jobs: Sequence[Job], asked: Asked, out: Path | None, cluster: Client, told: Told, done: Done
+    jobs: Sequence[Job],
+    settings: DiagnosisSettings,
+    out: Path | None,
+    cluster: Client,
+    report_progress: ReportProgress,
+    done: ReportResult,
 ) -> list[Diagnosed]:
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
     Args:
         out: folder in which a folder for each recording is written.
         cluster: a client of the scheduler; running work is cancelled if this ends early.
-        told: called with a recording's name and its current step.
+        report_progress: called with a recording's name and its current step.
 
     Returns:
         The results, in the order of the jobs.
@@ -141,13 +146,13 @@ def diagnose_all(
         done(result)
 
     futures: dict[Future[Any], _Read] = {}
-    cluster.subscribe_topic(TOPIC, lambda event: told(*event[1]))
+    cluster.subscribe_topic(TOPIC, lambda event: report_progress(*event[1]))
     try:
         for read in map(_read, jobs):
             if isinstance(read, Diagnosed):
                 take(read)
                 continue
-            work = cluster.submit(_work, read, asked, out is not None, key=f"diagnose-{read.job.name}", pure=False)
+            work = cluster.submit(_work, read, settings, out is not None, key=f"diagnose-{read.job.name}", pure=False)
             futures[work] = read
         for future in as_completed(list(futures), raise_errors=False):
             take(_result(future, futures[future], out))
@@ -228,7 +233,7 @@ def _read(job: Job) -> _Read | Diagnosed:
         return Diagnosed(job, config.robot.name, config.robot.joints, error=str(error))
 
 
-def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, ReportedDiagnosis | None] | str:
+def _work(read: _Read, settings: DiagnosisSettings, with_report: bool) -> tuple[bytes, ReportedDiagnosis | None] | str:
     """Diagnose on a worker: return diagnosis.json, and the input of the other files if they are written.
 
     Returns the reason as text if there is none, since not every exception of ours can be unpickled.
@@ -237,7 +242,7 @@ def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, Reported
 
     worker = get_worker()
     try:
-        found = run(read.config, read.source, asked, lambda said: worker.log_event(TOPIC, (read.job.name, said)))
+        found = run(read.config, read.source, settings, lambda said: worker.log_event(TOPIC, (read.job.name, said)))
     except BodyschemaError as error:
         return str(error)
     return found.json.encode(), found if with_report else None

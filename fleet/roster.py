@@ -111,7 +111,7 @@ class Fleet:
         self._places = places
         self._sessions: dict[Route, ZenohSession] = {}
         self._open = ExitStack()
-        self.unreached: list[str] = []  # reasons why routes could not be queried the last time
+        self.unreachable: list[str] = []  # reasons why routes could not be queried the last time
 
     def __enter__(self) -> Self:
         return self
@@ -119,17 +119,17 @@ class Fleet:
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def look(self) -> list[Member]:
+    def poll(self) -> list[Member]:
         """Return the robots now, by name; raise BusError if none of the routes can be reached."""
         members = {name: Member(name) for place in self._places for name in place.robots}
-        self.unreached = []
+        self.unreachable = []
         for place in self._places:
             try:
-                self._look_at(place, members)
+                self._poll_place(place, members)
             except BusError as error:
-                self.unreached.append(str(error))
-        if len(self.unreached) == len(self._places):
-            raise BusError(self.unreached[0])
+                self.unreachable.append(str(error))
+        if len(self.unreachable) == len(self._places):
+            raise BusError(self.unreachable[0])
         return [members[name] for name in sorted(members)]
 
     def bus(self, route: Route) -> ZenohSession:
@@ -138,7 +138,7 @@ class Fleet:
             self._sessions[route] = self._open.enter_context(ZenohSession(connect=route, client=True))
         return self._sessions[route]
 
-    def _look_at(self, place: Place, members: dict[str, Member]) -> None:
+    def _poll_place(self, place: Place, members: dict[str, Member]) -> None:
         bus = self.bus(place.route)
         asked = [EVERYBODY]
         tokens = bus.alive(Keys(EVERYBODY).alive(EVERYBODY), timeout_s=Waits.answer_limit_s)
@@ -184,7 +184,7 @@ def as_json(members: Sequence[Member]) -> str:
     ).decode()
 
 
-def screen(members: Sequence[Member], unreached: Sequence[str]) -> RenderableType:
+def screen(members: Sequence[Member], unreachable: Sequence[str]) -> RenderableType:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("robot", overflow="fold")
     table.add_column("state", no_wrap=True)
@@ -194,7 +194,7 @@ def screen(members: Sequence[Member], unreached: Sequence[str]) -> RenderableTyp
     table.add_column("health", justify="right", no_wrap=True)
     for member in members:
         table.add_row(*_row(member))
-    wrong = [f"{member.name}: {sentence}" for member in members for sentence in member.health] + list(unreached)
+    wrong = [f"{member.name}: {sentence}" for member in members for sentence in member.health] + list(unreachable)
     lines = [Text(f"! {as_typed(sentence)}", style="yellow") for sentence in wrong]
     return Group(table, *([Padding(Group(*lines), (1, 0, 0, 0))] if lines else []))
 

@@ -12,11 +12,11 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.diagnosis.report.numbers import mm, numbers_of, place, telling
+from bodyschema.diagnosis.report.numbers import mm, numbers_of, place, significant_numbers
 from bodyschema.diagnosis.report.result import Cause
 from bodyschema.diagnosis.report.text import in_order
 
-from .diagnosing import Diagnosed, Done, Told
+from .diagnosing import Diagnosed, ReportProgress, ReportResult
 
 FEWEST_TO_SHARE = 3  # with at least this many units, a cause of more than half of them is attributed to the description
 # Causes of the robot's placement, which do not concern its type.
@@ -74,7 +74,7 @@ def row(result: Diagnosed) -> Row:
         recording=str(result.job.recording),
         robot=result.robot,
         verdict=None if file is None else file.verdict,
-        causes=() if file is None else tuple(_told(cause, result.timed) for cause in in_order(file.causes)),
+        causes=() if file is None else tuple(_cause_text(cause, result.timed) for cause in in_order(file.causes)),
         gain_percent=None if file is None else file.gain.held_out_percent,
         aligned_mm=None if file is None else file.rms_mm.aligned,
         extended_mm=None if file is None else file.rms_mm.extended,
@@ -83,9 +83,9 @@ def row(result: Diagnosed) -> Row:
     )
 
 
-def _told(cause: Cause, timed: bool) -> str:
+def _cause_text(cause: Cause, timed: bool) -> str:
     """Return a cause with its numbers, such as `joint_scale at elbow: scale +2.01 ± 0.03 %`."""
-    numbers = ", ".join(f"{number.label} {number}" for number in telling(numbers_of(cause, timed=timed)))
+    numbers = ", ".join(f"{number.label} {number}" for number in significant_numbers(numbers_of(cause, timed=timed)))
     return f"{place(cause)}: {numbers}" if numbers else place(cause)
 
 
@@ -100,7 +100,7 @@ def _type(joints: tuple[str, ...], units: Sequence[Diagnosed]) -> Type:
     for unit in units:
         if unit.file is None or unit.file.verdict == "nothing_found":
             continue
-        own = [_told(cause, unit.timed) for cause in in_order(unit.file.causes) if place(cause) not in common]
+        own = [_cause_text(cause, unit.timed) for cause in in_order(unit.file.causes) if place(cause) not in common]
         if unit.file.unexplained.depends_on:
             own.append(f"something unexplained that depends on {', '.join(unit.file.unexplained.depends_on)}")
         if own:
@@ -114,7 +114,7 @@ _STYLES = {"explained": "green", "nothing_found": "blue", "undecided": "yellow",
 
 
 @contextmanager
-def progress(console: Console, count: int) -> Iterator[tuple[Told, Done]]:
+def progress(console: Console, count: int) -> Iterator[tuple[ReportProgress, ReportResult]]:
     """Yield the callbacks of `diagnose_all`: progress bars on a terminal, otherwise one line per recording."""
     if not console.is_terminal:
         finished = 0

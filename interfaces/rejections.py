@@ -74,6 +74,6 @@ REMEDIES: Mapping[Reason, str] = {
 }
 
 
-def words_of(reason: str) -> str:
+def rejection_text(reason: str) -> str:
     """Return the description of a reason in a status message, also for a reason of a newer version."""
     return WORDS[Reason(reason)] if reason in set(Reason) else reason.replace("_", " ")

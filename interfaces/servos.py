@@ -20,7 +20,7 @@ class Sample(Protocol):
     def current(self) -> float | None: ...
 
 
-class Fitted(Protocol):
+class MountedServo(Protocol):
     """An identified servo; see `bodyschema.drivers.servos.handshake.IdentifiedServo`."""
 
     @property
@@ -44,7 +44,7 @@ class ServoJoints(EncoderJoints, Protocol):
     """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
-    def servos(self) -> Sequence[Fitted]: ...
+    def servos(self) -> Sequence[MountedServo]: ...
 
     @property
     def samples(self) -> Mapping[str, Sample | None]: ...

@@ -27,7 +27,7 @@ def require_target(
 
 
 @contextmanager
-def writing(
+def raising_write_errors(
     file: Path, error: type[ConfigError | RecordingError] = ConfigError, *, what: str = "written", remedy: str = ""
 ) -> Iterator[None]:
     """Raise `error` with the system's reason if `file` cannot be created or written."""
@@ -37,7 +37,7 @@ def writing(
         raise error(f"cannot be {what}: {failed.strerror or failed}", file=file, remedy=remedy) from failed
 
 
-def write_whole(contents: Mapping[Path, bytes], *, mode: int | None = None) -> None:
+def write_atomically(contents: Mapping[Path, bytes], *, mode: int | None = None) -> None:
     """Write files, replacing existing ones: all of them once all are on the disk, otherwise none.
 
     Args:
@@ -64,7 +64,7 @@ def write_whole(contents: Mapping[Path, bytes], *, mode: int | None = None) -> N
             part.unlink(missing_ok=True)
 
 
-def replace_kept(file: Path, data: bytes, beside: Mapping[str, bytes] | None = None) -> Path:
+def replace_with_backup(file: Path, data: bytes, beside: Mapping[str, bytes] | None = None) -> Path:
     """Replace a file, and keep the old one beside it; return the name of the old one.
 
     The target of a link is replaced, not the link. Permissions stay.
@@ -81,7 +81,7 @@ def replace_kept(file: Path, data: bytes, beside: Mapping[str, bytes] | None = N
     backup = free_backup(target)
     others = {target.with_name(f"{target.name}{ending}"): text for ending, text in (beside or {}).items()}
     contents = {backup: target.read_bytes(), **others, target: data}
-    write_whole(contents, mode=stat.S_IMODE(target.stat().st_mode))
+    write_atomically(contents, mode=stat.S_IMODE(target.stat().st_mode))
     return backup
 
 

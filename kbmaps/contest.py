@@ -22,8 +22,8 @@ class ContestSettings:
     # what answers are promised to stay within; fewer than 50 pairs scatter by about as much. Sensitivity, mean error on
     # 90 pairs each of two measured arms (UR5 0.158 mm, UR10 0.409 mm), a solution every ten: 0.3 to 3 times as many
     # pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
-    lately: int = 50
-    worse: float = 1.2
+    recent_pairs: int = 50
+    worse_ratio: float = 1.2
     least_m: float = 1e-6  # a difference too small for any camera [m]
     # A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
     cap: float = 9.0
@@ -121,10 +121,10 @@ class PrequentialComparison:
         self._pairs += count
         most = int(max(ContestSettings.shortest, ContestSettings.share * self._pairs))
         self._length = min(self._length + count, ContestSettings.longest, most)
-        none = np.full(count, math.nan)
+        missing = np.full(count, math.nan)
         for name, values in self._errors.items():
-            more = added.get(name, none)
-            kept = np.concatenate([values, np.where(np.isfinite(more), more, math.nan)])
+            new = added.get(name, missing)
+            kept = np.concatenate([values, np.where(np.isfinite(new), new, math.nan)])
             self._errors[name] = kept[-self._length :]
 
     def add_late(self, name: str, squares: ArrayLike) -> None:
@@ -149,21 +149,21 @@ class PrequentialComparison:
 
         A model that has predicted few of the pairs of `answering` is left out.
         """
-        last = {name: values[-ContestSettings.lately :] for name, values in self._errors.items()}
-        seen = {name: np.isfinite(values) for name, values in last.items()}
-        if answering not in seen or not seen[answering].any():
-            answering = max(seen, key=lambda name: int(seen[name].sum()), default="")
+        last = {name: values[-ContestSettings.recent_pairs :] for name, values in self._errors.items()}
+        predicted = {name: np.isfinite(values) for name, values in last.items()}
+        if answering not in predicted or not predicted[answering].any():
+            answering = max(predicted, key=lambda name: int(predicted[name].sum()), default="")
         if not answering:
             return Recent(0, {})
-        common = seen[answering]
+        common = predicted[answering]
         fewest = min(ContestSettings.listed, int(common.sum()))
-        listed = [name for name in seen if (seen[name] & seen[answering]).sum() >= fewest]
+        listed = [name for name in predicted if (predicted[name] & predicted[answering]).sum() >= fewest]
         for name in listed:
-            common = common & seen[name]
+            common = common & predicted[name]
         pairs = int(common.sum())
         return Recent(pairs, {name: float(np.sqrt(last[name][common]).mean()) for name in listed} if pairs else {})
 
-    def best(self, trusted: Sequence[str], present: str) -> str:
+    def best(self, trusted: Sequence[str], current: str) -> str:
         """Return the model that answers: the most trusted one that no other beats.
 
         One beats another if the other's mean error is a fifth larger on the newest pairs of both, or if its squared
@@ -171,36 +171,38 @@ class PrequentialComparison:
 
         Args:
             trusted: the models, the most trusted first.
-            present: the model that answers while too few pairs were predicted.
+            current: the model that answers while too few pairs were predicted.
         """
         errors = ((name, self._errors.get(name)) for name in trusted)
-        tried = {
+        candidates = {
             name: values for name, values in errors if values is not None and _count(values) >= ContestSettings.fewest
         }
-        rivals = {name: [other for rival, other in tried.items() if rival != name] for name in tried}
-        lately = [name for name in tried if not any(_worse_lately(tried[name], other) for other in rivals[name])]
-        for name in lately:
-            if not any(_clearly_worse(tried[name], other) for other in rivals[name]):
+        others = {name: [other for rival, other in candidates.items() if rival != name] for name in candidates}
+        recent_pairs = [
+            name for name in candidates if not any(_recently_worse(candidates[name], other) for other in others[name])
+        ]
+        for name in recent_pairs:
+            if not any(_significantly_worse(candidates[name], other) for other in others[name]):
                 return name
-        return lately[0] if lately else present
+        return recent_pairs[0] if recent_pairs else current
 
 
 def _count(errors: FloatArray) -> int:
     return int(np.isfinite(errors).sum())
 
 
-def _worse_lately(errors: FloatArray, others: FloatArray) -> bool:
-    errors, others = errors[-ContestSettings.lately :], others[-ContestSettings.lately :]
+def _recently_worse(errors: FloatArray, others: FloatArray) -> bool:
+    errors, others = errors[-ContestSettings.recent_pairs :], others[-ContestSettings.recent_pairs :]
     both = np.isfinite(errors) & np.isfinite(others)
     if both.sum() < ContestSettings.fewest:
         return False
     return (
         float(np.sqrt(errors[both]).mean())
-        > ContestSettings.worse * float(np.sqrt(others[both]).mean()) + ContestSettings.least_m
+        > ContestSettings.worse_ratio * float(np.sqrt(others[both]).mean()) + ContestSettings.least_m
     )
 
 
-def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
+def _significantly_worse(errors: FloatArray, others: FloatArray) -> bool:
     both = np.isfinite(errors) & np.isfinite(others)
     errors, others, count = errors[both], others[both], int(both.sum())
     if count < ContestSettings.fewest:

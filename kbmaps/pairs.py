@@ -49,12 +49,12 @@ def with_units(
 
     As soon as one is unknown, the others count relative to their median, which also replaces the missing ones.
     """
-    told = ~np.isnan(sigma)
-    if told.all():
+    given = ~np.isnan(sigma)
+    if given.all():
         return Pairs(q, x, sigma, len(q) > 0, shape, common)
-    if not told.any():
+    if not given.any():
         return Pairs(q, x, np.ones(len(q)), False, shape, common)
-    return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False, shape, common)
+    return Pairs(q, x, np.where(given, sigma / np.median(sigma[given]), 1.0), False, shape, common)
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -100,13 +100,13 @@ def of_covariances(covariances: ArrayLike, pairs: int) -> tuple[FloatArray, Floa
     Raises:
         ShapeError, NonFiniteError, SettingError: one is not positive definite.
     """
-    told = numbers("cov", covariances)
-    if told.shape not in ((3, 3), (pairs, 3, 3)):
-        raise ShapeError("cov", f"(3, 3) or ({pairs}, 3, 3)", told.shape)
-    if not np.isfinite(told).all():
+    cov = numbers("cov", covariances)
+    if cov.shape not in ((3, 3), (pairs, 3, 3)):
+        raise ShapeError("cov", f"(3, 3) or ({pairs}, 3, 3)", cov.shape)
+    if not np.isfinite(cov).all():
         raise NonFiniteError("cov")
     try:
-        roots = np.linalg.cholesky(np.broadcast_to(told, (pairs, 3, 3)))
+        roots = np.linalg.cholesky(np.broadcast_to(cov, (pairs, 3, 3)))
     except np.linalg.LinAlgError as error:
         raise SettingError("every covariance must be symmetric and positive definite") from error
     sigma = np.cbrt(np.diagonal(roots, axis1=1, axis2=2).prod(axis=1))

@@ -21,7 +21,7 @@ class _Settings:
 _ROWS, _COLUMNS = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
 
 
-def tells_directions(stated: FloatArray) -> bool:
+def is_anisotropic(stated: FloatArray) -> bool:
     """Return True if any of the stated covariances (n, 3, 3), NaN if missing, is anisotropic."""
     values = np.linalg.eigvalsh(stated[~np.isnan(stated).any(axis=(1, 2))])
     return bool((values[:, 2] - values[:, 0] > _Settings.alike_share * values[:, 2]).any())
@@ -41,23 +41,23 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
         readings: J, derivatives of the positions by the joints (n, 3, d) [m/rad].
     """
     variances = np.trace(stated, axis1=1, axis2=2) / 3.0
-    told = variances > 0.0
-    stated = np.where(told[:, None, None], stated, np.eye(3) * float(variances[told].mean()))
+    has_stated = variances > 0.0
+    stated = np.where(has_stated[:, None, None], stated, np.eye(3) * float(variances[has_stated].mean()))
     values, axes = np.linalg.eigh(stated)
-    least_sure = axes[:, :, 2] * np.sqrt(values[:, 2:])
+    least_certain = axes[:, :, 2] * np.sqrt(values[:, 2:])
     parts = np.stack(
         [
             stated,
-            least_sure[:, :, None] * least_sure[:, None, :],
+            least_certain[:, :, None] * least_certain[:, None, :],
             readings @ readings.mT,
             np.broadcast_to(np.eye(3), stated.shape),
         ],
         axis=1,
     )
     parts = parts[:, parts.any(axis=(0, 2, 3))]
-    some = evenly_spread(len(errors), _Settings.most_errors)
-    spread, units = in_typical_units(parts[some], errors[some])
-    shares, _ = most_probable_shares(spread, errors[some], leave_out=True)
+    sample = evenly_spread(len(errors), _Settings.most_errors)
+    spread, units = in_typical_units(parts[sample], errors[sample])
+    shares, _ = most_probable_shares(spread, errors[sample], leave_out=True)
     return np.einsum("k,nkij->nij", shares * units, parts) + RobustSettings.rounding_m**2 * np.eye(3)
 
 

@@ -38,17 +38,17 @@ class ModelBank:
     """
 
     def __init__(self, prior: KBMap) -> None:
-        self._fixed = {PRIOR: prior}
+        self._solved_maps = {PRIOR: prior}
         self._residual: LearntModel | None = None
         self._instant = NLMS(prior)
         self._instant_map: KBMap | None = prior
-        self._asked: KBMap | None = None
+        self._requested_map: KBMap | None = None
         # map of the instant learner when the current solutions were requested; None before any
         self.delayed: KBMap | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (*self._fixed, INSTANT) if self._residual is None else (*self._fixed, INSTANT, RESIDUAL)
+        return (*self._solved_maps, INSTANT) if self._residual is None else (*self._solved_maps, INSTANT, RESIDUAL)
 
     @property
     def maps(self) -> Mapping[str, KBMap]:
@@ -57,7 +57,7 @@ class ModelBank:
 
     @property
     def prior(self) -> KBMap:
-        return self._fixed[PRIOR]
+        return self._solved_maps[PRIOR]
 
     def model(self, name: str) -> LearntModel:
         """Return one of the current models; later learning does not change it."""
@@ -66,12 +66,12 @@ class ModelBank:
     def map(self, name: str) -> KBMap:
         """Return one of the KB-Maps. The instant learner's is copied on demand, not with each pair."""
         if name != INSTANT:
-            return self._fixed[name]
+            return self._solved_maps[name]
         if self._instant_map is None:
             try:
                 self._instant_map = self._instant.map
             except NonFiniteError:  # overflow on absurd numbers: restart from the prior instead of answering NaN
-                return self._begun_again()
+                return self._restart_instant()
         return self._instant_map
 
     def predict(self, name: str, q: FloatArray) -> FloatArray:
@@ -79,7 +79,7 @@ class ModelBank:
         if name != INSTANT or self._instant_map is not None:
             return self.model(name).predict(q)
         predicted = self._instant.predict(q)
-        return predicted if np.isfinite(predicted).all() else self._begun_again().predict(q)
+        return predicted if np.isfinite(predicted).all() else self._restart_instant().predict(q)
 
     def predictions(self, q: FloatArray, instant: FloatArray) -> dict[str, FloatArray]:
         """Return positions (n, 3) [m] at q (n, d) [rad] by model; those of the instant learner are given."""
@@ -87,8 +87,8 @@ class ModelBank:
 
     def learn(self, q: FloatArray, error: FloatArray, limit_m: float) -> None:
         """Take one step of the instant learner for the pair at q (d,); its error (3,) [m] is clipped to `limit_m`."""
-        counted = error * min(1.0, limit_m / max(float(np.linalg.norm(error)), 1e-300))
-        self._instant.learn(q, self.predict(INSTANT, q) + counted)
+        clipped = error * min(1.0, limit_m / max(float(np.linalg.norm(error)), 1e-300))
+        self._instant.learn(q, self.predict(INSTANT, q) + clipped)
         self._instant_map = None
 
     def replay(self, q: FloatArray, x: FloatArray) -> None:
@@ -96,23 +96,23 @@ class ModelBank:
         self._instant.replay(q, x)
         self._instant_map = None
 
-    def ask(self) -> None:
-        self._asked = self.map(INSTANT)
+    def request_solution(self) -> None:
+        self._requested_map = self.map(INSTANT)
 
     def take(self, name: str, solution: LearntModel) -> None:
         if isinstance(solution, KBMap):
-            self._fixed[name] = solution
+            self._solved_maps[name] = solution
         else:
             self._residual = solution
-        self.delayed = self._asked
+        self.delayed = self._requested_map
 
-    def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
+    def replace_prior(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
         """Use another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.
 
         The solutions stay: they fit the pairs.
         """
-        self._fixed[PRIOR] = prior
-        self._begun_again()
+        self._solved_maps[PRIOR] = prior
+        self._restart_instant()
         self.replay(q, x)
 
     def nets(self) -> dict[str, FloatArray]:
@@ -124,10 +124,10 @@ class ModelBank:
         """Resume from `nets` and the chain with residual."""
         maps = {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
         self._residual, self.delayed, self._instant_map = residual, maps.pop(_DELAYED, None), maps.pop(INSTANT)
-        self._fixed |= maps
+        self._solved_maps |= maps
         self._instant = NLMS(self._instant_map)
 
-    def _begun_again(self) -> KBMap:
+    def _restart_instant(self) -> KBMap:
         """Return the map of an instant learner restarted from the prior."""
         self._instant, self._instant_map = NLMS(self.prior), self.prior
         return self._instant_map

@@ -54,10 +54,12 @@ class NominalModel:
     def __post_init__(self) -> None:
         slides = self.chain.prismatic
         low, high = np.where(slides, self.lower, -np.pi), np.where(slides, self.upper, np.pi)
-        missing = np.maximum(NominalSettings.narrowest_stroke_m - (high - low), 0.0) / 2.0
+        widening = np.maximum(NominalSettings.narrowest_stroke_m - (high - low), 0.0) / 2.0
         object.__setattr__(self, "lower", frozen_array(self.lower))
         object.__setattr__(self, "upper", frozen_array(self.upper))
-        object.__setattr__(self, "bases", learning_bases(low - missing, high + missing, self.chain.prismatic.tolist()))
+        object.__setattr__(
+            self, "bases", learning_bases(low - widening, high + widening, self.chain.prismatic.tolist())
+        )
 
     @classmethod
     def of(cls, robot: RobotDescription) -> NominalModel:
@@ -73,8 +75,10 @@ class NominalModel:
         since = simulation.since.placed
         robot = since.robot
         known = robot.camera.pose_known, robot.robot.marker_known
-        bent = len(since.all_effects) > len(since.rigid.all_effects) or since.residual is not None
-        return cls(since.rigid_chain, robot.lower, robot.upper, *known, since if bent and all(known) else None)
+        has_deviations = len(since.all_effects) > len(since.rigid.all_effects) or since.residual is not None
+        return cls(
+            since.rigid_chain, robot.lower, robot.upper, *known, since if has_deviations and all(known) else None
+        )
 
     @property
     def joints(self) -> int:
@@ -107,8 +111,8 @@ class NominalModel:
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
         """Return a hash of this nominal model with these tolerances; a state only fits the ones it was made with."""
-        said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior.digest}"
-        return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
+        identity = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior.digest}"
+        return hashlib.blake2b(identity.encode(), digest_size=8).hexdigest()
 
     @cached_property
     def prior(self) -> KBMap:
@@ -117,8 +121,8 @@ class NominalModel:
         if self.extended is None or (nodes := self._nodes()) is None:
             return prior
         q = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, self.joints)
-        bent = self.extended.positions(Motion.still(q)) - self.chain.positions(q)
-        net = bent.T.reshape(3, *map(len, nodes))
+        deviations = self.extended.positions(Motion.still(q)) - self.chain.positions(q)
+        net = deviations.T.reshape(3, *map(len, nodes))
         for k, basis in enumerate(self.bases):
             solve = np.linalg.pinv(basis.weights(nodes[k]))
             net = np.moveaxis(np.tensordot(solve, net, axes=(1, k + 1)), 0, k + 1)
@@ -154,7 +158,7 @@ class NominalModel:
             known = replace(known, tool=ArmSettings.other_tool_m)
         return known
 
-    def placed(self, q: FloatArray, x: FloatArray) -> RigidChain:
+    def aligned_chain(self, q: FloatArray, x: FloatArray) -> RigidChain:
         """Return the chain with an unknown pose fitted to pairs, q (n, d) [rad] and x (n, 3) [m].
 
         Its marker is at its nominal position.

@@ -57,19 +57,19 @@ class OnlineLearner:
         *,
         # maximum wait of pairs to be evaluated together [s], at a fraction of the cost of single ones. The instant
         # learner does not wait.
-        together_s: float = 0.0,
+        batch_wait_s: float = 0.0,
         common: Callable[[FloatArray], FloatArray] | None = None,  # as in `Snapshot`
     ) -> None:
         self.nominal, self._settings, self._common = nominal, settings, common
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()
-        self._together_s = together_s
+        self._batch_wait_s = batch_wait_s
         self._task_numbers = itertools.count(1)
         self._before: LearningState | None = None
-        self._met_at = 0.0
+        self._pending_since = 0.0
         self._counters, self._curve = Counters(), Curve()
         self._newest_utc: str | None = None
-        self._regimes = self._at_nominal()
+        self._regimes = self._initial_regimes()
         self._publish()
 
     @property
@@ -84,7 +84,7 @@ class OnlineLearner:
     @property
     def aligning(self) -> bool:
         """True while the frame is not known."""
-        return self._regimes.present is None
+        return self._regimes.current is None
 
     @property
     def at_rest(self) -> bool:
@@ -93,10 +93,12 @@ class OnlineLearner:
         For the thread that calls `work`.
         """
         with self._lock:
-            regime, count = self._regimes.present, self._regimes.memory.count
-            if self._regimes.fitting.due(count) or self._regimes.looking or not self._settled:
+            regime, count = self._regimes.current, self._regimes.memory.count
+            if self._regimes.fitting.due(count) or self._regimes.review_due or not self._nothing_pending:
                 return False
-            return regime is None or (not regime.owes_replays and self._solving.has_solved(regime.task_number, count))
+            return regime is None or (
+                not regime.has_due_replays and self._solving.has_solved(regime.task_number, count)
+            )
 
     @property
     def counters(self) -> Counters:
@@ -123,7 +125,7 @@ class OnlineLearner:
     def recent(self) -> Recent:
         """Return the models' errors on the last pairs, each predicted before it was learnt."""
         with self._lock:
-            regime = self._regimes.present
+            regime = self._regimes.current
             return Recent(0, {}) if regime is None else regime.recent
 
     def claimed_error_m(self) -> float | None:
@@ -132,7 +134,7 @@ class OnlineLearner:
         None if there are too few pairs. The region is within a few degrees (`region_rad` per joint) of the kept pairs.
         """
         with self._lock:
-            regime, snapshot = self._regimes.present, self._snapshot
+            regime, snapshot = self._regimes.current, self._snapshot
             answering = None if regime is None else self._regimes.claims.errors.get(regime.answering)
             if (
                 regime is None or answering is None or answering.weight < UncertaintySettings.warm_pairs / 2
@@ -144,7 +146,7 @@ class OnlineLearner:
     def common_error_m(self) -> float | None:
         """Return the expected mean error [m] in the data's region that all pairs share; None if it is unknown."""
         with self._lock:
-            regime, snapshot = self._regimes.present, self._snapshot
+            regime, snapshot = self._regimes.current, self._snapshot
             if regime is None or len(regime.memory) == 0:
                 return None
             region = self._region(regime)
@@ -159,7 +161,7 @@ class OnlineLearner:
     def orientation_status(self) -> OrientationStatus | None:
         """Return the accuracy of the marker's orientation; None if no pair with the current tool has one."""
         with self._lock:
-            regime, model = self._regimes.present, self._snapshot.orientation
+            regime, model = self._regimes.current, self._snapshot.orientation
             if regime is None or model is None:
                 return None
             known, region = regime.orientations, self._region(regime)
@@ -173,10 +175,10 @@ class OnlineLearner:
         For the thread that calls `work`.
         """
         with self._lock:
-            regime, claims = self._regimes.present, self._regimes.claims
+            regime, claims = self._regimes.current, self._regimes.claims
             if regime is None or claims.belief is None or not self._solving.works_on(regime.task_number):
                 return None
-            seen, *_ = regime.memory.some(regime.memory.count, RegimeSettings.looked_back)
+            seen, *_ = regime.memory.spread_before(regime.memory.count, RegimeSettings.looked_back)
             known = self._solving.fed  # number of pairs that the solver knows
             q, x, _ = regime.memory.since(known - RegimeSettings.looked_back, RegimeSettings.looked_back)
             return LearnerEvidence(
@@ -184,7 +186,7 @@ class OnlineLearner:
                 belief=claims.belief,
                 wide=claims.wide or claims.belief,
                 tolerances=chain_tolerances(self._settings),
-                claim=claims.of(regime.answering, regime.model.predict),
+                uncertainty=claims.of(regime.answering, regime.model.predict),
                 solved=regime.answering in SOLVED,
                 pairs=self._counters.since_change,
                 region=self._region(regime),
@@ -215,27 +217,27 @@ class OnlineLearner:
             self._counters.pairs += 1
             self._counters.since_change += 1
             self._newest_utc = pair.utc
-            regime = self._regimes.present
+            regime = self._regimes.current
             if regime is None:
                 turn = None if pair.R is None else pair.R[None]
                 self._regimes.waiting.append(pair.q[None], pair.x[None], pair.cov[None], turn)
-            elif self._together_s == 0.0:
-                self._judged(regime, [pair], np.array([not regime.learn(pair)]))
+            elif self._batch_wait_s == 0.0:
+                self._record_learnt(regime, [pair], np.array([not regime.learn(pair)]))
             else:
-                if not regime.met:
-                    self._met_at = now
-                regime.meet(pair)
+                if not regime.pending:
+                    self._pending_since = now
+                regime.learn_instantly(pair)
                 enough = max(int(OnlineSettings.together_share * regime.memory.count), 1)
                 enough = min(OnlineSettings.most_together, enough)
-                if len(regime.met) >= enough or self._judge_due(now):
-                    self._judge()
+                if len(regime.pending) >= enough or self._is_learning_due(now):
+                    self._learn_pending()
             self._publish()
 
-    def judge_due(self, now: float) -> None:
+    def learn_due(self, now: float) -> None:
         """Process the pairs that have waited long enough."""
         with self._lock:
-            if self._judge_due(now):
-                self._judge()
+            if self._is_learning_due(now):
+                self._learn_pending()
                 self._publish()
 
     def refuse(self) -> None:
@@ -254,13 +256,13 @@ class OnlineLearner:
     def tool_changed(self) -> None:
         """Start with another tool: drop the pairs so far, and continue from the learnt model."""
         with self._lock:
-            self._judge()
-            if self._regimes.present is None:
-                self._regimes = self._at_nominal()
+            self._learn_pending()
+            if self._regimes.current is None:
+                self._regimes = self._initial_regimes()
             else:
                 self._before = self._state_before(self._regimes.memory.count)
-                self._regimes.change_tool(self._regimes.present)
-            self._regimes.change = ChangeRecord.told(self._counters.last_seq)
+                self._regimes.change_tool(self._regimes.current)
+            self._regimes.change = ChangeRecord.reported(self._counters.last_seq)
             self._counters.changes += 1
             self._counters.since_change = 0
             self._publish()
@@ -286,15 +288,15 @@ class OnlineLearner:
                 self._counters = Counters(refused=self._counters.refused)
                 self._curve, self._newest_utc = Curve(), None
             self._counters.since_change = 0
-            self._regimes, self._before = self._at_nominal(), None
+            self._regimes, self._before = self._initial_regimes(), None
             self._publish()
 
     def restart_solver(self) -> None:
         """Send all pairs again to a solver that has lost them. For the thread that calls `work`."""
         self._solving.restart()
         with self._lock:
-            if self._regimes.present is not None:
-                self._regimes.present.solve_from_what_is_known()
+            if self._regimes.current is not None:
+                self._regimes.current.continue_from_last_solutions()
 
     def solve_soon(self) -> None:
         """Start the solver even with fewer than `solve_every` new pairs. For the same thread."""
@@ -302,12 +304,12 @@ class OnlineLearner:
 
     def work(self) -> bool:
         """Do one small piece of background work; return False if there is none."""
-        return self._fit() or self._look_again() or self._serve_solver() or self._replay()
+        return self._fit() or self._review_change() or self._serve_solver() or self._replay()
 
     def state(self) -> LearningState:
         """Return everything needed to resume."""
         with self._lock:
-            self._judge()
+            self._learn_pending()
             return self._regimes.state(self._counters, self._curve).with_before(self._before)
 
     def restore(self, state: LearningState) -> None:
@@ -323,43 +325,43 @@ class OnlineLearner:
             self._publish()
 
     @property
-    def _settled(self) -> bool:
+    def _nothing_pending(self) -> bool:
         """True if all pairs so far have been evaluated."""
-        return self._regimes.present is None or not self._regimes.present.met
+        return self._regimes.current is None or not self._regimes.current.pending
 
-    def _judge_due(self, now: float) -> bool:
+    def _is_learning_due(self, now: float) -> bool:
         """Return True if pairs have waited long enough to be evaluated."""
-        return not self._settled and now - self._met_at >= self._together_s
+        return not self._nothing_pending and now - self._pending_since >= self._batch_wait_s
 
-    def _judge(self) -> None:
+    def _learn_pending(self) -> None:
         """Evaluate all waiting pairs: compare the models, gate outliers, look for a change, and keep the pairs."""
-        while (regime := self._regimes.present) is not None and regime.met:
-            self._judged(regime, *regime.judge())
-            if self._regimes.present is not None and self._regimes.present is not regime:
-                for pair in regime.met:
-                    self._regimes.present.meet(pair)
+        while (regime := self._regimes.current) is not None and regime.pending:
+            self._record_learnt(regime, *regime.learn_pending())
+            if self._regimes.current is not None and self._regimes.current is not regime:
+                for pair in regime.pending:
+                    self._regimes.current.learn_instantly(pair)
 
-    def _judged(self, regime: Regime, pairs: Sequence[Pair], doubted: BoolArray) -> None:
+    def _record_learnt(self, regime: Regime, pairs: Sequence[Pair], doubted: BoolArray) -> None:
         """Count the pairs that `regime` has learnt or gated as outliers, and follow a change detected in them."""
         error_m = regime.recent.means.get(regime.answering)
-        first = self._counters.pairs - len(regime.met) - len(pairs) + 1
+        first = self._counters.pairs - len(regime.pending) - len(pairs) + 1
         if error_m is not None:
             for place in np.flatnonzero(~doubted).tolist():
                 self._curve.add(first + place, error_m)
         self._counters.doubted += int(doubted.sum())
-        if self._followed(regime, pairs[-1], learnt=not doubted[-1]):
+        if self._follow_change(regime, pairs[-1], learnt=not doubted[-1]):
             self._counters.changes += 1
-            self._counters.since_change = self._regimes.memory.count + len(regime.met)
+            self._counters.since_change = self._regimes.memory.count + len(regime.pending)
 
-    def _followed(self, regime: Regime, pair: Pair, *, learnt: bool) -> bool:
+    def _follow_change(self, regime: Regime, pair: Pair, *, learnt: bool) -> bool:
         """Return True if the pairs up to this one reveal a change, so that another regime has begun with it."""
-        noticed = self._regimes.noticed(regime, pair)
-        if noticed is None and (learnt or not regime.gate.perhaps_changed):
+        detected = self._regimes.detected(regime, pair)
+        if detected is None and (learnt or not regime.gate.possibly_changed):
             return False
-        since = 0 if noticed is None else sum(noticed.kept[noticed.first :])
+        since = 0 if detected is None else sum(detected.kept[detected.first :])
         before = self._state_before(regime.memory.count - since)
-        followed = noticed is not None and self._regimes.adapt(regime, noticed)
-        if not (followed or (not learnt and self._regimes.follow_change(regime, pair))):
+        adapted = detected is not None and self._regimes.adapt(regime, detected)
+        if not (adapted or (not learnt and self._regimes.follow_tool_change(regime, pair))):
             return False
         self._before = before
         return True
@@ -367,19 +369,19 @@ class OnlineLearner:
     def _state_before(self, first: int) -> LearningState:
         """Return the state without the current regime's pairs from number `first` on."""
         state = self._regimes.state_before(first, self._counters, self._curve)
-        state.header.counters.since_change -= 0 if self._regimes.present is None else len(self._regimes.present.met)
+        state.header.counters.since_change -= 0 if self._regimes.current is None else len(self._regimes.current.pending)
         return state
 
-    def _at_nominal(self) -> Regimes:
-        return Regimes.at_nominal(self.nominal, self._settings, self._task_numbers)
+    def _initial_regimes(self) -> Regimes:
+        return Regimes.initial(self.nominal, self._settings, self._task_numbers)
 
-    def _look_again(self) -> bool:
+    def _review_change(self) -> bool:
         """Identify the last change again, with more pairs."""
         with self._lock:
-            if not self._regimes.looking:
+            if not self._regimes.review_due:
                 return False
-            self._judge()
-            if self._regimes.look_again():
+            self._learn_pending()
+            if self._regimes.review_change():
                 self._counters.since_change = self._regimes.memory.count
                 self._publish()
         return True
@@ -394,7 +396,7 @@ class OnlineLearner:
             (q, x), cov = memory.all(), memory.cov_since(0)
         fit = fitting.fit(q, x, cov)
         with self._lock:
-            self._judge()
+            self._learn_pending()
             if memory is self._regimes.memory:  # otherwise another regime has begun
                 self._counters.doubted += self._regimes.fitted(fit, count)
                 self._publish()
@@ -404,30 +406,30 @@ class OnlineLearner:
         """Send the solver its pairs, request solutions at intervals, and take its results."""
         solving = self._solving
         with self._lock:
-            if self._regimes.present is None:
+            if self._regimes.current is None:
                 return False
-            task = self._regimes.present.task
+            task = self._regimes.current.task
         if solving.busy:
             return self._take_solution()
         if solving.begin(task):
             return True
         with self._lock:
-            regime = self._regimes.present
+            regime = self._regimes.current
             if regime is None or regime.task_number != task.number:
                 return True
             asking = solving.due and solving.fed == regime.memory.count
             if asking:
-                self._judge()  # the solver must know everything that the instant learner knows
-                if self._regimes.present is not regime:
+                self._learn_pending()  # the solver must know everything that the instant learner knows
+                if self._regimes.current is not regime:
                     return True
-                regime.ask()
+                regime.request_solution()
             q, x, fed = regime.memory.since(solving.fed, OnlineSettings.feed_pairs)
             both = regime.memory.cov_since, regime.memory.turns_since
             cov, turns = (each(solving.fed, OnlineSettings.feed_pairs) for each in both)
         if len(q):
             solving.feed(q, x, fed, cov, turns if np.isfinite(turns).any() else None)
         if asking:
-            solving.ask()
+            solving.request_solution()
         return asking or len(q) > 0
 
     def _take_solution(self) -> bool:
@@ -435,7 +437,7 @@ class OnlineLearner:
         if solved is None:
             return False
         with self._lock:
-            regime = self._regimes.present
+            regime = self._regimes.current
             if regime is None or solved.task != regime.task_number:
                 return True
             if solved.model is not None:
@@ -447,20 +449,20 @@ class OnlineLearner:
 
     def _replay(self) -> bool:
         with self._lock:
-            replayed = 0 if self._regimes.present is None else self._regimes.present.replay()
+            replayed = 0 if self._regimes.current is None else self._regimes.current.replay()
             if replayed:
                 self._counters.replayed += replayed
                 self._publish()
         return replayed > 0
 
     def _publish(self) -> None:
-        regime, claims = self._regimes.present, self._regimes.claims
+        regime, claims = self._regimes.current, self._regimes.claims
         answering = PRIOR if regime is None else regime.answering
         self._snapshot = Snapshot(
             answering=answering,
             model=None if regime is None else regime.model,
             map=None if regime is None else regime.map,
-            claim=claims.of(answering, None if regime is None else regime.model.predict),
+            uncertainty=claims.of(answering, None if regime is None else regime.model.predict),
             support=claims.support,
             pairs=self._counters.pairs,
             newest_utc=self._newest_utc,

@@ -53,25 +53,25 @@ class AngleMemory(msgspec.Struct):
     noise: float = 0.0  # sum of the measurements' variances, all three axes [rad²]; 0 where not given
     ratio: float = 0.0  # sum of their squares, each divided by the predicted one
 
-    def add(self, angle: float, noise: float, claimed: float) -> None:
+    def add(self, angle: float, noise: float, expected: float) -> None:
         """Add an error of this angle [rad].
 
         Args:
             angle: angle of the error [rad].
             noise: expected square of the measurement's noise [rad²].
-            claimed: expected square of noise and model error together [rad²].
+            expected: expected square of noise and model error together [rad²].
         """
         self.weight = UncertaintySettings.discount * self.weight + 1.0
         self.angle = UncertaintySettings.discount * self.angle + angle
         self.square = UncertaintySettings.discount * self.square + angle**2
         self.noise = UncertaintySettings.discount * self.noise + noise
-        self.ratio = UncertaintySettings.discount * self.ratio + angle**2 / max(claimed, 1e-18)
+        self.ratio = UncertaintySettings.discount * self.ratio + angle**2 / max(expected, 1e-18)
 
     @property
-    def surprise(self) -> float:
+    def inflation(self) -> float:
         """Ratio of the errors to the predicted ones, at least 1."""
-        few = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
-        return math.sqrt(max((self.ratio + few) / max(self.weight, UncertaintySettings.warm_pairs), 1.0))
+        prior_weight = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + prior_weight) / max(self.weight, UncertaintySettings.warm_pairs), 1.0))
 
 
 class OrientationState(msgspec.Struct, kw_only=True):
@@ -95,8 +95,8 @@ class OrientationModel:
     name: str  # of the model
     chain: OrientedChain  # the rigid chain that gives the uncertainty, and answers itself unless there is a map
     map: KBMap | None  # of e1, e2, e3
-    inside: float  # 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad]
-    surprise: float  # ratio of the prediction errors to the predicted ones, at least 1
+    in_sample: float  # 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad]
+    inflation: float  # ratio of the prediction errors to the predicted ones, at least 1
     support: SupportSet | None  # support of the data; None without data
 
     def rotations(self, q: FloatArray) -> FloatArray:
@@ -105,15 +105,15 @@ class OrientationModel:
 
     def predict(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return orientations (n, 3, 3) at q (n, d) [rad], and their variance about each axis (n, 3) [rad²]."""
-        rotations, left_open = self.chain.orientation_with_variance(q)
+        rotations, variance_at_q = self.chain.orientation_with_variance(q)
         if self.map is not None:
-            of_chain, rotations = rotations, self.rotations(q)
+            chain_rotations, rotations = rotations, self.rotations(q)
             # Away from the data the map is no better than the chain; their difference measures its error.
-            departure = rotation_vectors(rotations @ of_chain.swapaxes(1, 2))
-            left_open = left_open + unexplained(self.support, q)[:, None] * np.square(departure)
-        return rotations, self.surprise**2 * (self.inside**2 + left_open)
+            departure = rotation_vectors(rotations @ chain_rotations.swapaxes(1, 2))
+            variance_at_q = variance_at_q + unexplained(self.support, q)[:, None] * np.square(departure)
+        return rotations, self.inflation**2 * (self.in_sample**2 + variance_at_q)
 
-    def planes(self, kbmap: KBMap) -> KBMap:
+    def with_orientation(self, kbmap: KBMap) -> KBMap:
         """Return `kbmap` with the nine planes of e1, e2, e3 in its bases."""
         turned = self.map if self.map is not None else self.chain.chain.to_kbmap(kbmap.bases, orientation=True)
         return KBMap(kbmap.bases, np.concatenate([kbmap.net[:3], turned.net[3:]]), kbmap.metadata)
@@ -132,19 +132,19 @@ class Orientations:
 
     def __init__(self, chain: RigidChain) -> None:
         parameters = ChainParameters(chain)
-        self._drawn = ChainBelief(parameters, np.zeros(parameters.size), np.zeros((parameters.size, 0)))
+        self._nominal = ChainBelief(parameters, np.zeros(parameters.size), np.zeros((parameters.size, 0)))
         self._first: list[tuple[FloatArray, FloatArray]] = []
         self._chains: dict[str, OrientedChain] = {}
         self._map: KBMap | None = None
         self._map_noise = self._noise = 0.0
-        self._contest = PrequentialComparison()
+        self._comparison = PrequentialComparison()
         self.pairs = 0
         self.answering = PRIOR
         self.errors: dict[str, AngleMemory] = {}
 
     def model(self, support: SupportSet | None) -> OrientationModel | None:
         """Return the answering model; None before the first orientation."""
-        return self._named(self.answering, support) if self.answering in self._names else None
+        return self._build_model(self.answering, support) if self.answering in self._names else None
 
     def prequential_rad(self) -> dict[str, float]:
         """Return the recent mean angle between prediction and measurement, before learning [rad], by model."""
@@ -163,14 +163,14 @@ class Orientations:
         noise = 0.0 if cov is None else float(np.trace(cov))
         squares: dict[str, float] = {}
         for name in self._names:
-            rotation, variance = self._named(name, support).predict(q[None])
+            rotation, variance = self._build_model(name, support).predict(q[None])
             angle = float(np.linalg.norm(rotation_vectors(measured[None] @ rotation.swapaxes(1, 2))))
             self.errors.setdefault(name, AngleMemory()).add(angle, noise, float(variance.sum()) + noise)
             squares[name] = angle**2
-        self._contest.add(squares)
+        self._comparison.add(squares)
         self.pairs += 1
         self._noise += (noise / 3.0 - self._noise) / min(self.pairs, 1.0 / (1.0 - UncertaintySettings.discount))
-        self._fit_drawn(q, measured)
+        self._fit_nominal(q, measured)
         self._choose()
 
     def take(self, solution: OrientationSolution) -> None:
@@ -205,33 +205,33 @@ class Orientations:
     def _names(self) -> tuple[str, ...]:
         return (*self._chains, EXACT) if self._map is not None else tuple(self._chains)
 
-    def _named(self, name: str, support: SupportSet | None) -> OrientationModel:
+    def _build_model(self, name: str, support: SupportSet | None) -> OrientationModel:
         solved = self._chains.get(RIGID)
         chain = self._chains[PRIOR] if name == PRIOR or solved is None else solved
-        around = self._map_noise if name == EXACT else chain.noise
-        surprise = self.errors.get(name, AngleMemory()).surprise
+        spread = self._map_noise if name == EXACT else chain.noise
+        inflation = self.errors.get(name, AngleMemory()).inflation
         mapped = self._map if name == EXACT else None
-        return OrientationModel(name, chain, mapped, self._misfit(around), surprise, support)
+        return OrientationModel(name, chain, mapped, self._model_sigma(spread), inflation, support)
 
-    def _misfit(self, around: float) -> float:
+    def _model_sigma(self, spread: float) -> float:
         """Return the 1-sigma of the truth around a model [rad], about one axis, given that of the measurements.
 
         The measurements' claimed noise is subtracted, within the resolution of this number of pairs.
         """
         resolution = math.sqrt(2.0 / (3.0 * max(self.pairs, 1)))
-        return math.sqrt(max(around**2 - self._noise, around**2 * resolution if self._noise else around**2))
+        return math.sqrt(max(spread**2 - self._noise, spread**2 * resolution if self._noise else spread**2))
 
-    def _fit_drawn(self, q: FloatArray, measured: FloatArray) -> None:
+    def _fit_nominal(self, q: FloatArray, measured: FloatArray) -> None:
         if len(self._first) == OrientationSettings.first_pairs or self.pairs > OrientationSettings.first_pairs:
             return
         self._first.append((q, measured))
         count = len(self._first)
         if count & (count - 1) == 0:
             angles, rotations = (np.array(values) for values in zip(*self._first, strict=True))
-            self._chains[PRIOR] = fitted_orientation(self._drawn, angles, rotations)
+            self._chains[PRIOR] = fitted_orientation(self._nominal, angles, rotations)
 
     def _choose(self) -> None:
-        self.answering = self._contest.best(TRUSTED, self.answering)
-        untried = RIGID in self._chains and not self._contest.compares(RIGID)
-        if self.answering == PRIOR and self.pairs >= OrientationSettings.fewest_to_trust and untried:
+        self.answering = self._comparison.best(TRUSTED, self.answering)
+        untested = RIGID in self._chains and not self._comparison.compares(RIGID)
+        if self.answering == PRIOR and self.pairs >= OrientationSettings.fewest_to_trust and untested:
             self.answering = RIGID

@@ -11,16 +11,24 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.changes.known_arm import Adapted, KnownArm, Origin
+from bodyschema.learning.changes.known_arm import Adapted, ArmBeforeChange, KnownArm
 from bodyschema.learning.changes.monitor import DetectedChange, MonitorSettings
-from bodyschema.learning.changes.outlier_gate import OutlierSettings, explained, sound
+from bodyschema.learning.changes.outlier_gate import OutlierSettings, inlier_mask, is_explained
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.nominal import NominalModel, NominalSettings, chain_tolerances
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.solver import fitted_belief
-from bodyschema.learning.state import NET, PAIRS, Counters, Curve, LearningHeader, LearningState, StateError
+from bodyschema.learning.state import (
+    NET_PREFIX,
+    PAIR_ARRAYS,
+    Counters,
+    Curve,
+    LearningHeader,
+    LearningState,
+    StateError,
+)
 from bodyschema.learning.status import ChangeRecord, KindOfChange, NamingSettings
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanation, KBMap, RigidChain
@@ -62,7 +70,7 @@ class Fitting:
         """
         self._before, self.chain, self.due_at, self.is_first = before, hand, first_at, True
 
-    def rest(self, hand: RigidChain) -> None:
+    def stop(self, hand: RigidChain) -> None:
         """Stop fitting. `hand` is a chain that gives the orientation of the hand."""
         self._before, self.chain, self.due_at, self.is_first = None, hand, None, False
 
@@ -75,13 +83,13 @@ class Fitting:
         try:
             if self._before is not None:
                 return Fit(self._nominal.with_other_tool(self._before, self.chain, q, x), self.chain)
-            placed = self._nominal.placed(q, x)
+            aligned_chain = self._nominal.aligned_chain(q, x)
         except DegenerateDataError:
             return None
-        belief = fitted_belief(self._nominal.belief(placed, self._tolerances), q, x, cov)
-        return Fit(belief.chain.to_kbmap(self._nominal.bases), placed, belief)
+        belief = fitted_belief(self._nominal.belief(aligned_chain, self._tolerances), q, x, cov)
+        return Fit(belief.chain.to_kbmap(self._nominal.bases), aligned_chain, belief)
 
-    def done(self, pairs: int, fit: Fit | None) -> None:
+    def completed(self, pairs: int, fit: Fit | None) -> None:
         if fit is None:
             self.due_at = pairs + max(self._nominal.pairs_to_align, NominalSettings.pairs_to_refit)
         else:
@@ -119,17 +127,17 @@ class Regimes:
         self.claims = UncertaintyTracker(nominal.bases, EXPECTED_M)
         self.fitting = Fitting(nominal, chain_tolerances(settings))  # fits of the frame or the tool as a whole
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)  # the pairs that wait for the first regime
-        self.present: Regime | None = None  # the current regime; None before the frame is known
+        self.current: Regime | None = None  # the current regime; None before the frame is known
         self.change: ChangeRecord | None = None  # the last change; None if there was none
-        self._origin: Origin | None = None
-        self._look_at = 0
+        self._origin: ArmBeforeChange | None = None
+        self._next_review_at = 0
 
     @classmethod
-    def at_nominal(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Regimes:
+    def initial(cls, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> Regimes:
         """Return the state before any pair."""
         regimes = cls(nominal, settings, task_numbers)
         if nominal.frame_known:
-            regimes.present = regimes._regime(nominal.prior, regimes._drawn(nominal.chain))
+            regimes.current = regimes._regime(nominal.prior, regimes._nominal_arm(nominal.chain))
         return regimes
 
     @classmethod
@@ -147,8 +155,8 @@ class Regimes:
             raise StateError(
                 "it belongs to another nominal model or to other tolerances: robot.toml or the URDF has changed since"
             )
-        if (poisoned := state.poisoned()) is not None:
-            raise StateError(f"it is of no use: {poisoned} is not finite or too large")
+        if (invalid_array := state.invalid_array()) is not None:
+            raise StateError(f"it is of no use: {invalid_array} is not finite or too large")
         regimes.fitting.restore(header.next_fit, header.first_fit, arrays)
         regimes.claims.restore(header.claims, arrays)
         regimes.change = header.change
@@ -156,8 +164,8 @@ class Regimes:
             regimes.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("cov"), arrays.get("turns"))
         else:
             arm = KnownArm.from_bytes(header.belief, regimes._tolerances, header.residual)
-            regimes.present = regimes._regime(KBMap(nominal.bases, arrays[NET + PRIOR]), arm)
-            regimes.present.restore(header, arrays)
+            regimes.current = regimes._regime(KBMap(nominal.bases, arrays[NET_PREFIX + PRIOR]), arm)
+            regimes.current.restore(header, arrays)
         return regimes
 
     def state(self, counters: Counters, curve: Curve) -> LearningState:
@@ -175,22 +183,22 @@ class Regimes:
             change=self.change,
         )
         arrays = self.claims.arrays() | self.fitting.arrays() | {"q": q, "x": x}
-        for name, some in (("cov", self.memory.cov_since(0)), ("turns", self.memory.turns_since(0))):
-            if np.isfinite(some).any():
-                arrays[name] = some
-        if self.present is not None:
-            arrays |= self.present.store(header)
+        for name, values in (("cov", self.memory.cov_since(0)), ("turns", self.memory.turns_since(0))):
+            if np.isfinite(values).any():
+                arrays[name] = values
+        if self.current is not None:
+            arrays |= self.current.store(header)
         return LearningState(header, arrays)
 
     @property
     def memory(self) -> PairMemory:
-        return self.waiting if self.present is None else self.present.memory
+        return self.waiting if self.current is None else self.current.memory
 
     def state_before(self, first: int, counters: Counters, curve: Curve) -> LearningState:
         """Return the state without the pairs from number `first` of the current regime on."""
         state = self.state(counters, curve)
         kept = self.memory.place_of(first)
-        arrays = {name: each[:kept] if name in PAIRS else each for name, each in state.arrays.items()}
+        arrays = {name: array[:kept] if name in PAIR_ARRAYS else array for name, array in state.arrays.items()}
         if "doubted_q" in arrays:
             arrays |= {name: arrays[name][:0] for name in ("doubted_q", "doubted_x")}
         state.header.doubted_in_a_row, state.header.kept_of = 0, min(first, self.memory.count)
@@ -199,74 +207,74 @@ class Regimes:
 
     def change_tool(self, regime: Regime) -> None:
         """Begin the regime of another, unknown tool after `regime`."""
-        self.present, self._origin = self._next(regime, EXPECTED_M), None
+        self.current, self._origin = self._regime_of_next_tool(regime, EXPECTED_M), None
 
-    def follow_change(self, regime: Regime, pair: Pair) -> bool:
+    def follow_tool_change(self, regime: Regime, pair: Pair) -> bool:
         """Begin the regime of another tool if the consecutive outliers of `regime` up to `pair` are its first pairs."""
         gate = regime.gate
-        if not (gate.changed or (gate.perhaps_changed and self._moved_together(regime, pair))):
+        if not (gate.changed or (gate.possibly_changed and self._is_tool_displacement(regime, pair))):
             return False
         q, x = gate.run()
         distances = np.linalg.norm(regime.model.predict(q) - x, axis=1)
-        self.present = self._next(regime, max(float(np.median(distances)), EXPECTED_M), first_fit=len(q))
-        self.present.begin_with(q, x)
+        self.current = self._regime_of_next_tool(regime, max(float(np.median(distances)), EXPECTED_M), first_fit=len(q))
+        self.current.learn_former_outliers(q, x)
         first = pair.seq - len(q) + 1
-        self.change, self._origin = ChangeRecord.unnamed(first, pair.seq, self._nominal.joints), None
+        self.change, self._origin = ChangeRecord.unidentified(first, pair.seq, self._nominal.joints), None
         return True
 
-    def noticed(self, regime: Regime, pair: Pair) -> DetectedChange | None:
+    def detected(self, regime: Regime, pair: Pair) -> DetectedChange | None:
         """Return the change detected in the pairs of `regime`, the last of which is `pair`; None if there is none."""
         if not regime.monitor.ready:
             return None
         gate = regime.gate
-        together = gate.perhaps_changed and self._moved_together(regime, pair)
-        noticed = regime.monitor.noticed(run=gate.in_a_row if gate.changed or together else 0)
+        together = gate.possibly_changed and self._is_tool_displacement(regime, pair)
+        detected = regime.monitor.detected(run=gate.consecutive if gate.changed or together else 0)
         fewest = OutlierSettings.explained_change_pairs
-        return None if noticed is None or len(noticed.q) - noticed.first < fewest else noticed
+        return None if detected is None or len(detected.q) - detected.first < fewest else detected
 
-    def adapt(self, regime: Regime, noticed: DetectedChange) -> bool:
+    def adapt(self, regime: Regime, detected: DetectedChange) -> bool:
         """Begin the regime after a change, if that improves the held-out predictions of the pairs since."""
-        q, x = noticed.q[noticed.first :], noticed.x[noticed.first :]
-        origin = Origin(noticed, regime.arm)
+        q, x = detected.q[detected.first :], detected.x[detected.first :]
+        origin = ArmBeforeChange(detected, regime.arm)
         found = origin.explain(q, x)
-        cov = noticed.cov[noticed.first :]
-        if not origin.is_better(found, q, x, cov):
+        cov = detected.cov[detected.first :]
+        if not origin.improves_prediction(found, q, x, cov):
             regime.monitor.refute()
             return False
-        self._look_at = int(MonitorSettings.look_again * len(q)) + 1
-        seqs = (*noticed.seqs, noticed.seqs[-1] + 1)
+        self._next_review_at = int(MonitorSettings.review_change * len(q)) + 1
+        seqs = (*detected.seqs, detected.seqs[-1] + 1)
         self.change = ChangeRecord(
-            first_seq=noticed.seqs[noticed.first],
-            earliest_seq=seqs[noticed.earliest],
-            latest_seq=seqs[noticed.latest],
-            noticed_seq=noticed.seqs[-1],
+            first_seq=detected.seqs[detected.first],
+            earliest_seq=seqs[detected.earliest],
+            latest_seq=seqs[detected.latest],
+            noticed_seq=detected.seqs[-1],
             found=True,
-            kinds=_described(found),
+            kinds=_kinds_of_change(found),
             moved_m=found[0].moved_m,
         )
-        turns = noticed.turns[noticed.first :]
+        turns = detected.turns[detected.first :]
         self._begin_adapted(regime, origin.adapt(found, q, x, cov), q, x, cov, turns)
         self._origin = origin
         return True
 
     @property
-    def looking(self) -> bool:
+    def review_due(self) -> bool:
         """True if it is time to identify the change again."""
-        return self._origin is not None and self.memory.count >= self._look_at
+        return self._origin is not None and self.memory.count >= self._next_review_at
 
-    def look_again(self) -> bool:
+    def review_change(self) -> bool:
         """Identify the change by all pairs since; return True if a different part of the arm is now relearnt."""
-        if self._origin is None or self.change is None or self.present is None:
+        if self._origin is None or self.change is None or self.current is None:
             return False
-        origin, was, (q, x) = self._origin, self.change.named, self.memory.all()
+        origin, previous, (q, x) = self._origin, self.change.named, self.memory.all()
         found = origin.explain(q, x)
-        self.change = msgspec.structs.replace(self.change, kinds=_described(found), moved_m=found[0].moved_m)
+        self.change = msgspec.structs.replace(self.change, kinds=_kinds_of_change(found), moved_m=found[0].moved_m)
         named = self.change.named
-        other = named is not None and (was is None or (was.name, was.joint) != (named.name, named.joint))
+        other = named is not None and (previous is None or (previous.name, previous.joint) != (named.name, named.joint))
         if other and self.memory.complete:
             cov, turns = self.memory.cov_since(0), self.memory.turns_since(0)
-            self._begin_adapted(self.present, origin.adapt(found, q, x, cov), q, x, cov, turns)
-        self._look_at = int(MonitorSettings.look_again * len(q)) + 1
+            self._begin_adapted(self.current, origin.adapt(found, q, x, cov), q, x, cov, turns)
+        self._next_review_at = int(MonitorSettings.review_change * len(q)) + 1
         if len(q) > NamingSettings.named_within_pairs:
             self._origin = None
         return other
@@ -275,50 +283,52 @@ class Regimes:
         self, regime: Regime, adapted: Adapted, q: FloatArray, x: FloatArray, cov: FloatArray, turns: FloatArray
     ) -> None:
         """Begin the regime that keeps everything except the changed part, with pairs q (n, d), x (n, 3) since then."""
-        belongs = sound(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
-        self.fitting.rest(adapted.belief.chain)
+        inliers = inlier_mask(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
+        self.fitting.stop(adapted.belief.chain)
         self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), regime.answering)
-        self.present = self._regime(adapted.prior, adapted.arm)
-        self.present.learn_waiting(q[belongs], x[belongs], cov[belongs], turns[belongs], adapted.belief)
+        self.current = self._regime(adapted.prior, adapted.arm)
+        self.current.learn_deferred(q[inliers], x[inliers], cov[inliers], turns[inliers], adapted.belief)
 
     def fitted(self, fit: Fit | None, pairs: int) -> int:
         """Continue from a fit to the first `pairs` pairs; return the number of new outliers."""
         is_first = self.fitting.is_first
-        self.fitting.done(pairs, fit)
+        self.fitting.completed(pairs, fit)
         if fit is None:
             return 0
-        if self.present is None:
+        if self.current is None:
             return 0 if fit.belief is None else self._begin_first(fit, fit.belief)
-        doubted = self.present.set_aside(fit.prior) if is_first else 0
-        self.present.change_prior(fit.prior)
-        return doubted
+        outliers = self.current.drop_outliers(fit.prior) if is_first else 0
+        self.current.change_prior(fit.prior)
+        return outliers
 
     def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
         """Learn the pairs that waited for the frame, except those that contradict the fit."""
         (q, x), cov, turns = self.waiting.all(), self.waiting.cov_since(0), self.waiting.turns_since(0)
-        belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
+        inliers = inlier_mask(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
-        self.present = self._regime(fit.prior, self._drawn(fit.chain))
-        self.present.learn_waiting(q[belongs], x[belongs], cov[belongs], turns[belongs], belief)
-        return int((~belongs).sum())
+        self.current = self._regime(fit.prior, self._nominal_arm(fit.chain))
+        self.current.learn_deferred(q[inliers], x[inliers], cov[inliers], turns[inliers], belief)
+        return int((~inliers).sum())
 
-    def _next(self, regime: Regime, expected_m: float, first_fit: int = NominalSettings.pairs_to_refit) -> Regime:
+    def _regime_of_next_tool(
+        self, regime: Regime, expected_m: float, first_fit: int = NominalSettings.pairs_to_refit
+    ) -> Regime:
         """Return the regime of another tool, which begins where `regime` ends."""
         prior, arm = regime.map, regime.arm.updated(self.claims.wide, self.claims.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)
         self.claims.change_tool(expected_m, regime.answering)
         return self._regime(prior, arm.with_other_tool())
 
-    def _moved_together(self, regime: Regime, pair: Pair) -> bool:
+    def _is_tool_displacement(self, regime: Regime, pair: Pair) -> bool:
         """Return True if one other position of the marker on the hand explains the consecutive outliers."""
         expected_m = regime.limit_m(pair) / OutlierSettings.times_farther
         q, x = regime.gate.run()
-        answer = regime.model.predict(q)
+        predicted = regime.model.predict(q)
         # Without the answering model's terms beyond the map, which hold for any tool.
-        of_map = x - (answer - regime.map.predict(q))
-        moved = self._nominal.with_other_tool(regime.map, self._hand, q, of_map)
-        left = np.linalg.norm(of_map - moved.predict(q), axis=1)
-        return explained(np.linalg.norm(x - answer, axis=1), left, expected_m)
+        x_of_map = x - (predicted - regime.map.predict(q))
+        moved = self._nominal.with_other_tool(regime.map, self._hand, q, x_of_map)
+        residuals = np.linalg.norm(x_of_map - moved.predict(q), axis=1)
+        return is_explained(np.linalg.norm(x - predicted, axis=1), residuals, expected_m)
 
     @property
     def _hand(self) -> RigidChain:
@@ -329,7 +339,7 @@ class Regimes:
     def _regime(self, prior: KBMap, arm: KnownArm) -> Regime:
         return Regime(prior, arm, self.claims, self._settings, self._task_numbers)
 
-    def _drawn(self, chain: RigidChain) -> KnownArm:
+    def _nominal_arm(self, chain: RigidChain) -> KnownArm:
         return KnownArm(self._nominal.belief(chain, chain_tolerances(self._settings)), self._tolerances)
 
     @property
@@ -337,5 +347,5 @@ class Regimes:
         return self._nominal.tolerances(chain_tolerances(self._settings))
 
 
-def _described(found: list[Explanation]) -> list[KindOfChange]:
+def _kinds_of_change(found: list[Explanation]) -> list[KindOfChange]:
     return [KindOfChange(each.kind.name, each.kind.joint, each.probability) for each in found]

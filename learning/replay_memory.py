@@ -80,7 +80,7 @@ class PairMemory:
         q, x, _ = self.since(0)
         return q, x
 
-    def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def spread_before(self, end: int, limit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return at most `limit` of the kept pairs before the one numbered `end`, in order, as in `append`.
 
         They are evenly spread runs of `RUN` neighbours, which show the errors that neighbours on a path share.
@@ -89,17 +89,17 @@ class PairMemory:
         begins = np.linspace(self._oldest, end - RUN, max(limit // RUN, 1)).astype(np.intp)
         runs = (begins[:, None] + np.arange(min(RUN, limit))).ravel()
         numbers = np.arange(self._oldest, end) if kept <= limit else runs
-        return *self._numbered(numbers), self._cov[numbers % len(self._q)]
+        return *self._by_number(numbers), self._cov[numbers % len(self._q)]
 
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""
-        return self._numbered(self._oldest + places)
+        return self._by_number(self._oldest + places)
 
     @property
     def _oldest(self) -> int:
         return max(self._first, self.count - len(self._q))
 
-    def _numbered(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _by_number(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
         places = numbers % len(self._q)
         return self._q[places], self._x[places]
 

@@ -45,7 +45,7 @@ class Snapshot:
     answering: str  # its name
     model: LearntModel | None  # None while the frame is not known
     map: KBMap | None  # the best of the models that are KB-Maps, for export to a file; mostly the same one
-    claim: PredictiveUncertainty
+    uncertainty: PredictiveUncertainty
     support: SupportSet | None  # support of the data with the current tool; None without data
     pairs: int  # number of pairs it had learnt
     newest_utc: str | None  # storage time of the last of them, ISO 8601; None before any since the learner started
@@ -69,8 +69,12 @@ class Snapshot:
         """Return the best KB-Map, with the planes of e1, e2, e3 if learnt; raise NoFrameError if there is none yet."""
         if self.map is None:
             raise NoFrameError(self.waiting_for)
-        turned = self.orientation
-        return self.map if turned is None or self.map.size > SolverSettings.largest_net else turned.planes(self.map)
+        orientation = self.orientation
+        return (
+            self.map
+            if orientation is None or self.map.size > SolverSettings.largest_net
+            else orientation.with_orientation(self.map)
+        )
 
     def predict(self, q: FloatArray) -> Prediction:
         """Return predictions for joint angles q (n, d) [rad].
@@ -81,7 +85,7 @@ class Snapshot:
         """
         x = self.require_model().predict(q)
         shared = 0.0 if self.common is None else self.common(x)
-        sigma, in_support = np.sqrt(self.claim.variance(q) + shared), unexplained(self.support, q) < IN_SUPPORT
+        sigma, in_support = np.sqrt(self.uncertainty.variance(q) + shared), unexplained(self.support, q) < IN_SUPPORT
         if not (np.isfinite(x).all() and np.isfinite(sigma).all()):
             raise RequestError("the model has no finite answer at these joint angles; angles are in radians")
         if self.orientation is None:
@@ -91,7 +95,7 @@ class Snapshot:
 
     def expected_error_m(self, q: FloatArray) -> float:
         """Return the expected mean distance [m] to noise-free camera measurements, at q (n, d) [rad]."""
-        return MEAN_OVER_RMS * float(np.sqrt(self.claim.variance(q).sum(axis=1)).mean())
+        return MEAN_OVER_RMS * float(np.sqrt(self.uncertainty.variance(q).sum(axis=1)).mean())
 
     def common_error_m(self, q: FloatArray) -> float | None:
         """Return the expected mean error [m] that all pairs share, at q (n, d) [rad]; None if unknown."""

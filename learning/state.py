@@ -15,12 +15,12 @@ from bodyschema.learning.orientation import OrientationState
 from bodyschema.learning.status import ChangeRecord, CurvePoint
 from bodyschema.learning.uncertainty import UncertaintyState
 
-BEFORE = "before/"  # prefix of the arrays of the state before a change
-NET = "net_"  # prefix of stored nets
-PAIRS = ("q", "x", "cov", "turns")  # arrays with a row for each kept pair
+BEFORE_PREFIX = "before/"  # prefix of the arrays of the state before a change
+NET_PREFIX = "net_"  # prefix of stored nets
+PAIR_ARRAYS = ("q", "x", "cov", "turns")  # arrays with a row for each kept pair
 
 
-MOST_POINTS = 400  # of the learning curve
+MAX_CURVE_POINTS = 400  # of the learning curve
 
 
 class StateError(BodyschemaError):
@@ -65,7 +65,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     # state of the orientation models; None in a checkpoint of an older version
     orientation: OrientationState | None = None
     change: ChangeRecord | None = None  # the last change; None if there was none
-    # the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE`.
+    # the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE_PREFIX`.
     before: LearningHeader | None = None
 
 
@@ -85,7 +85,11 @@ class LearningState:
         """State before the last change; None if there is none."""
         if self.header.before is None:
             return None
-        arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}
+        arrays = {
+            name.removeprefix(BEFORE_PREFIX): each
+            for name, each in self.arrays.items()
+            if name.startswith(BEFORE_PREFIX)
+        }
         return LearningState(self.header.before, arrays)
 
     def with_before(self, before: LearningState | None) -> LearningState:
@@ -93,11 +97,13 @@ class LearningState:
         if before is None:
             return self
         header = msgspec.structs.replace(self.header, before=before.header)
-        return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
+        return LearningState(
+            header, {**self.arrays, **{BEFORE_PREFIX + name: each for name, each in before.arrays.items()}}
+        )
 
-    def poisoned(self) -> str | None:
+    def invalid_array(self) -> str | None:
         """Return the name of a net, or of an array of pairs, with impossible values; None if all are valid."""
-        nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
+        nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET_PREFIX)), np.inf)
         limits = {**nets, "q": PairLimits.largest_q, "x": PairLimits.farthest_m}
         for name, limit in limits.items():
             if not (np.isfinite(self.arrays[name]).all() and (np.abs(self.arrays[name]) <= limit).all()):
@@ -106,7 +112,7 @@ class LearningState:
 
 
 class Curve:
-    """Points of the learning curve, at most `MOST_POINTS`, evenly spread over the pairs."""
+    """Points of the learning curve, at most `MAX_CURVE_POINTS`, evenly spread over the pairs."""
 
     def __init__(self, points: list[CurvePoint] | None = None, stride: int = 1) -> None:
         self._points = list(points or [])
@@ -121,6 +127,6 @@ class Curve:
         if pairs % self.stride:
             return
         self._points.append(CurvePoint(pairs, error_m))
-        if len(self._points) > MOST_POINTS:
+        if len(self._points) > MAX_CURVE_POINTS:
             self.stride *= 2
             self._points = [point for point in self._points if point.pairs % self.stride == 0]

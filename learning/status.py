@@ -50,7 +50,7 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
     marker_covariance: list[float] | None = None  # of the marker in its link, 3 × 3 row by row [m²]; null likewise
 
 
-class Outlook(msgspec.Struct, frozen=True, kw_only=True):
+class DataOutlook(msgspec.Struct, frozen=True, kw_only=True):
     """Expected gain of further pairs."""
 
     pairs: int  # pairs with the present tool behind it
@@ -110,8 +110,8 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
     def named(self) -> KindOfChange | None:
         """Named kind; None while undecided. Kinds that no motion can separate count together."""
         best = self.kinds[0]
-        same = [kind for kind in self.kinds[1:] if kind.name == self.alike(best) or self.alike(kind) == best.name]
-        probability = best.probability + sum(kind.probability for kind in same)
+        equivalent = [kind for kind in self.kinds[1:] if kind.name == self.alike(best) or self.alike(kind) == best.name]
+        probability = best.probability + sum(kind.probability for kind in equivalent)
         return best if probability >= NamingSettings.named_probability else None
 
     def alike(self, kind: KindOfChange) -> str | None:
@@ -125,17 +125,17 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
         return None if kind.joint is None else ends.get(kind.joint)
 
     @classmethod
-    def told(cls, last_seq: int) -> ChangeRecord:
+    def reported(cls, last_seq: int) -> ChangeRecord:
         """Return the record of a reported tool change after the pair `last_seq`."""
-        return cls._begun(last_seq + 1, last_seq, False, [KindOfChange(TOOL, None, 1.0)])
+        return cls._starting_at(last_seq + 1, last_seq, False, [KindOfChange(TOOL, None, 1.0)])
 
     @classmethod
-    def unnamed(cls, first_seq: int, noticed_seq: int, joints: int) -> ChangeRecord:
+    def unidentified(cls, first_seq: int, noticed_seq: int, joints: int) -> ChangeRecord:
         """Return the record of a change detected before the arm was known well enough to identify its kind."""
         kinds = [KindOfChange(name, None, 1.0 / 3.0) for name in (TOOL, CAMERA)]
         kinds += [KindOfChange(JOINT, joint, 1.0 / (3.0 * joints)) for joint in range(joints)]
-        return cls._begun(first_seq, noticed_seq, True, kinds)
+        return cls._starting_at(first_seq, noticed_seq, True, kinds)
 
     @classmethod
-    def _begun(cls, first: int, noticed: int, found: bool, kinds: list[KindOfChange]) -> ChangeRecord:
+    def _starting_at(cls, first: int, noticed: int, found: bool, kinds: list[KindOfChange]) -> ChangeRecord:
         return cls(first_seq=first, earliest_seq=first, latest_seq=first, noticed_seq=noticed, found=found, kinds=kinds)

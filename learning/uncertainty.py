@@ -50,26 +50,26 @@ class ErrorMemory(msgspec.Struct):
             ratios: squared errors divided by the predicted squares of prediction and measurement (n,), or one for all.
         """
         count = len(errors)
-        kept, faded = self.discount**count, self.discount ** np.arange(count - 1.0, -1.0, -1.0)
+        decay, weights = self.discount**count, self.discount ** np.arange(count - 1.0, -1.0, -1.0)
         squares = np.square(errors)
-        self.weight = kept * self.weight + float(faded.sum())
-        self.square = _triple(kept * np.array(self.square) + faded @ squares)
-        self.noise = _triple(kept * np.array(self.noise) + faded @ np.broadcast_to(variances, squares.shape))
-        self.ratio = kept * self.ratio + float(faded @ np.broadcast_to(ratios, count))
+        self.weight = decay * self.weight + float(weights.sum())
+        self.square = _triple(decay * np.array(self.square) + weights @ squares)
+        self.noise = _triple(decay * np.array(self.noise) + weights @ np.broadcast_to(variances, squares.shape))
+        self.ratio = decay * self.ratio + float(weights @ np.broadcast_to(ratios, count))
 
     @property
     def rms_m(self) -> float:
         """RMS distance between prediction and measurement [m], shrunk towards the expected one while errors are few."""
-        missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        prior_weight = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
         weight = max(self.weight, UncertaintySettings.warm_pairs)
-        return math.sqrt((sum(self.square) + missing * self.expected_m**2) / weight)
+        return math.sqrt((sum(self.square) + prior_weight * self.expected_m**2) / weight)
 
     @property
     def sigma(self) -> FloatArray:
         """Uncertainty of the prediction against the truth, 1-sigma per axis (3,) [m]; noise is subtracted."""
-        missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        prior_weight = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
         weight = max(self.weight, UncertaintySettings.warm_pairs)
-        square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / weight
+        square = (np.array(self.square) + prior_weight * self.expected_m**2 / 3.0) / weight
         noise = self.noise_variance
         return np.sqrt(np.maximum(square - noise, noise * math.sqrt(2.0 / max(self.weight, 2.0))))
 
@@ -79,10 +79,10 @@ class ErrorMemory(msgspec.Struct):
         return np.array(self.noise) / max(self.weight, 1.0)
 
     @property
-    def surprise(self) -> float:
+    def inflation(self) -> float:
         """Ratio of the errors to the predicted ones, at least 1."""
-        missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
-        return math.sqrt(max((self.ratio + missing) / max(self.weight, UncertaintySettings.warm_pairs), 1.0))
+        prior_weight = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + prior_weight) / max(self.weight, UncertaintySettings.warm_pairs), 1.0))
 
 
 _SUPPORT, _CONTEST = "support_q", "squares_"
@@ -90,26 +90,26 @@ _SUPPORT, _CONTEST = "support_q", "squares_"
 
 @dataclass(frozen=True)
 class PredictiveUncertainty:
-    inside: FloatArray  # 1-sigma at the data, per axis (3,) [m]
-    layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()  # variance terms that the model's data leave
-    surprise: float = 1.0  # ratio of the prediction errors to the predicted ones, at least 1
+    in_sample: FloatArray  # 1-sigma at the data, per axis (3,) [m]
+    terms: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()  # variance terms that the model's data leave
+    inflation: float = 1.0  # ratio of the prediction errors to the predicted ones, at least 1
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Return the variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
-        return self.variance_there(QueryPoints(q))
+        return self.variance_at(QueryPoints(q))
 
-    def variance_there(self, where: QueryPoints) -> FloatArray:
+    def variance_at(self, points: QueryPoints) -> FloatArray:
         """Return the variance as in `variance`."""
-        left_open = sum((layer.variance(where) for layer in self.layers), np.zeros((len(where.q), 3)))
-        return self.surprise**2 * (self.inside**2 + left_open)
+        open_variance = sum((term.variance(points) for term in self.terms), np.zeros((len(points.q), 3)))
+        return self.inflation**2 * (self.in_sample**2 + open_variance)
 
-    def beyond_chain(self, q: FloatArray) -> FloatArray:
+    def variance_beyond_chain(self, q: FloatArray) -> FloatArray:
         """Return the part that is not uncertainty of the chain's parameters, at q (n, d) [rad], shape (n, 3) [m²]."""
-        where = QueryPoints(q)
-        open_layers = (
-            layer.variance(where) for layer in self.layers if isinstance(layer, VarianceTerm) and layer.sigma > 0.0
+        points = QueryPoints(q)
+        open_variances = (
+            term.variance(points) for term in self.terms if isinstance(term, VarianceTerm) and term.sigma > 0.0
         )
-        return self.inside**2 + sum(open_layers, np.zeros((len(q), 3)))
+        return self.in_sample**2 + sum(open_variances, np.zeros((len(q), 3)))
 
 
 class UncertaintyState(msgspec.Struct, kw_only=True):
@@ -142,35 +142,35 @@ class UncertaintyTracker:
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
         self._bases = bases
-        self._misfits_before: dict[str, FloatArray] = {}
+        self._previous_discrepancies: dict[str, FloatArray] = {}
         self._trusted = TRUSTED
         self._begin(expected_m)
 
     def _begin(self, expected_m: float) -> None:
         self._expected_m = expected_m
         self.errors = {name: ErrorMemory(expected_m) for name in (PRIOR, INSTANT)}
-        self._contest = PrequentialComparison()
+        self._comparison = PrequentialComparison()
         self._residuals: ErrorMemory | None = None
-        self._misfits: dict[str, FloatArray] = {}
+        self._discrepancies: dict[str, FloatArray] = {}
         self._support = GrowingSupport(self._bases)
-        self._asked: SupportSet | None = None
-        self._solved: dict[str, SupportSet | None] = {}
-        self._expected: ChainBelief | None = None
+        self._requested_support: SupportSet | None = None
+        self._solution_support: dict[str, SupportSet | None] = {}
+        self._chain_prior: ChainBelief | None = None
         self.belief: ChainBelief | None = None
         self.wide: ChainBelief | None = None
         self.residual: ResidualModel | None = None
 
-    def best(self, present: str) -> str:
-        """Return the best model; `present` if there is nothing to compare."""
-        return self._contest.best(self._trusted, present)
+    def best(self, current: str) -> str:
+        """Return the best model; `current` if there is nothing to compare."""
+        return self._comparison.best(self._trusted, current)
 
-    def best_map(self, present: str) -> str:
-        """Return the best of the models that are KB-Maps; `present` if there is nothing to compare."""
-        return self._contest.best([name for name in self._trusted if name != RESIDUAL], present)
+    def best_map(self, current: str) -> str:
+        """Return the best of the models that are KB-Maps; `current` if there is nothing to compare."""
+        return self._comparison.best([name for name in self._trusted if name != RESIDUAL], current)
 
     def recent(self, answering: str) -> Recent:
         """Return the models' errors on the last pairs, each of the age of the newest solution."""
-        return self._contest.recent(answering)
+        return self._comparison.recent(answering)
 
     @property
     def support(self) -> SupportSet | None:
@@ -183,30 +183,30 @@ class UncertaintyTracker:
         return float(np.sqrt(self.errors[PRIOR].noise_variance.sum()))
 
     def change_tool(self, expected_m: float, answered: str = PRIOR) -> None:
-        """Reset the models' errors for another tool; `expect` sets the posterior of the arm.
+        """Reset the models' errors for another tool; `set_prior` sets the posterior of the arm.
 
         The solved model that answered with the last tool is trusted first with this one, because the arm is the same.
         """
         if answered in SOLVED:
             self._trusted = (answered, *(name for name in TRUSTED if name != answered))
-        self._misfits_before |= self._misfits
+        self._previous_discrepancies |= self._discrepancies
         self._begin(expected_m)
 
-    def expect(self, belief: ChainBelief) -> None:
+    def set_prior(self, belief: ChainBelief) -> None:
         """Set the prior of the chain before the first pair with the current tool."""
-        self._expected = belief
+        self._chain_prior = belief
 
     def fitted(self, belief: ChainBelief) -> None:
         """Set the posterior of the chain from the first pairs, before any solution."""
         self.belief = self.wide = belief
 
-    def untried(self, name: str) -> bool:
+    def is_untested(self, name: str) -> bool:
         """Return True if this model has a solution that has predicted too few pairs to be compared."""
-        return name in self._misfits and not self._contest.compares(name)
+        return name in self._discrepancies and not self._comparison.compares(name)
 
     def predicted(
         self,
-        where: QueryPoints,
+        points: QueryPoints,
         x: FloatArray,
         predictions: Mapping[str, FloatArray],
         variances: FloatArray,
@@ -215,7 +215,7 @@ class UncertaintyTracker:
         """Record pairs, in order, each of which was predicted before it was learnt.
 
         Args:
-            where: their q (n, d) [rad].
+            points: their q (n, d) [rad].
             x: measured positions (n, 3) [m].
             predictions: predictions of x (n, 3) [m] by model.
             variances: variances of the measurements (n, 3) [m²].
@@ -224,10 +224,10 @@ class UncertaintyTracker:
         """
         for name, predicted in predictions.items():
             errors = x - predicted
-            claimed = self.of(name, lambda _, predicted=predicted: predicted).variance_there(where) + variances
-            self.errors[name].add(errors, variances, np.square(errors).sum(axis=1) / claimed.sum(axis=1))
+            expected_variance = self.of(name, lambda _, predicted=predicted: predicted).variance_at(points) + variances
+            self.errors[name].add(errors, variances, np.square(errors).sum(axis=1) / expected_variance.sum(axis=1))
         compared = dict(predictions) if delayed is None else {**predictions, INSTANT: delayed}
-        self._contest.add({name: np.square(x - each).sum(axis=1) for name, each in compared.items()})
+        self._comparison.add({name: np.square(x - each).sum(axis=1) for name, each in compared.items()})
 
     def learnt(self, q: FloatArray) -> None:
         """Record that pairs have been learnt at q (n, d) [rad]."""
@@ -238,10 +238,10 @@ class UncertaintyTracker:
         self._residuals = self._residuals or ErrorMemory(self._expected_m)
         self._residuals.add(errors, self.errors[PRIOR].noise_variance)
 
-    def solution_asked(self) -> None:
-        self._asked = self._support.view
+    def record_request(self) -> None:
+        self._requested_support = self._support.view
 
-    def solution_taken(
+    def record_solution(
         self,
         name: str,
         errors: FloatArray,
@@ -262,19 +262,19 @@ class UncertaintyTracker:
             variances: variances of these measurements (n, 3) [m²], NaN if unknown; None for the usual ones.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
-        self._solved[name] = self._asked
+        self._solution_support[name] = self._requested_support
         if isinstance(belief, ResidualModel):
             self.residual = belief
         elif belief is not None:
             self.belief, self.wide = belief, wide or belief
         noise = np.broadcast_to(self.errors[PRIOR].noise_variance, errors.shape)
         noise = noise if variances is None else np.where(np.isfinite(variances), variances, noise)
-        before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
+        before = self._previous_discrepancies.get(name, self._previous_discrepancies.get(RIGID, np.zeros(3)))
         scatter = 0.0 if belief is None else belief.noise
-        self._misfits[name] = model_discrepancy(errors, noise, before, neighbours=neighbours, scatter=scatter)
+        self._discrepancies[name] = model_discrepancy(errors, noise, before, neighbours=neighbours, scatter=scatter)
 
-    def predicted_late(
-        self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, instant: FloatArray, *, anew: bool
+    def record_late_errors(
+        self, name: str, predict: Predict, q: FloatArray, errors: FloatArray, instant: FloatArray, *, restart: bool
     ) -> None:
         """Record the errors of a new solution on the last pairs, none of which it was fitted to.
 
@@ -285,26 +285,26 @@ class UncertaintyTracker:
             errors: measured minus predicted (n, 3) [m].
             instant: the same errors of the instant learner at the time of the request. NaN if it had already learnt the
                 pair, which would be an unfair advantage.
-            anew: True if it knows so much more than the last solution that the latter's errors no longer apply.
+            restart: True if it knows so much more than the last solution that the latter's errors no longer apply.
         """
-        if anew:
-            self._contest.forget(name)
+        if restart:
+            self._comparison.forget(name)
             self.errors[name] = ErrorMemory(self._expected_m)
-        for each, missed in ((name, errors), (INSTANT, instant)):
-            self._contest.add_late(each, np.square(missed).sum(axis=1))
+        for each, errors_of_each in ((name, errors), (INSTANT, instant)):
+            self._comparison.add_late(each, np.square(errors_of_each).sum(axis=1))
         noise = self.errors[PRIOR].noise_variance
-        claimed = self.of(name, predict).variance(q) + noise
-        self.errors[name].add(errors, noise, np.square(errors).sum(axis=1) / claimed.sum(axis=1))
+        expected_variance = self.of(name, predict).variance(q) + noise
+        self.errors[name].add(errors, noise, np.square(errors).sum(axis=1) / expected_variance.sum(axis=1))
 
-    def forget_contest(self) -> None:
+    def reset_comparison(self) -> None:
         """Drop the comparison, because some pairs do not belong to this tool."""
-        self._contest = PrequentialComparison()
+        self._comparison = PrequentialComparison()
 
-    def prior_changed(self, errors: FloatArray) -> None:
+    def record_new_prior(self, errors: FloatArray) -> None:
         """Record another prior for the same pairs; its errors (n, 3) [m] at them."""
         noise = self.errors[PRIOR].noise_variance
         self.errors[PRIOR] = ErrorMemory(self._expected_m)
-        self._contest.forget(PRIOR)
+        self._comparison.forget(PRIOR)
         self.errors[PRIOR].add(errors, noise)
 
     def of(self, name: str, predict: Predict | None = None) -> PredictiveUncertainty:
@@ -315,38 +315,40 @@ class UncertaintyTracker:
             predict: its positions (n, 3) [m] at q (n, d) [rad]; None before the model exists.
         """
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
-        belief = self.belief or self._expected
+        belief = self.belief or self._chain_prior
         if belief is None or predict is None:
             return PredictiveUncertainty(memory.sigma)
         none = np.zeros(3)
         if name in SOLVED:
             chain = self.residual if name == RESIDUAL and self.residual is not None else belief
             return PredictiveUncertainty(
-                self._misfits.get(name, none), (ChainTerm(chain), self._rest(name)), memory.surprise
+                self._discrepancies.get(name, none), (ChainTerm(chain), self._unmodelled_term(name)), memory.inflation
             )
         if name == PRIOR:
             # The prior is a chain too, or was learnt with the last tool, so it has such a chain's discrepancy.
-            inside = self._misfits.get(RIGID, self._misfits_before.get(RIGID, none))
+            in_sample = self._discrepancies.get(RIGID, self._previous_discrepancies.get(RIGID, none))
             departure = DepartureTerm(predict, belief)
         else:
-            inside = (memory if self._residuals is None else self._residuals).sigma
+            in_sample = (memory if self._residuals is None else self._residuals).sigma
             departure = DepartureTerm(predict, belief, self.support)
-        return PredictiveUncertainty(inside, (ChainTerm(belief), departure, self._rest(RIGID)), memory.surprise)
+        return PredictiveUncertainty(
+            in_sample, (ChainTerm(belief), departure, self._unmodelled_term(RIGID)), memory.inflation
+        )
 
-    def _rest(self, name: str) -> VarianceTerm:
+    def _unmodelled_term(self, name: str) -> VarianceTerm:
         """Return the term for the arm's deviation from the chain away from data: as large as at the data."""
-        missed = self._misfits.get(RESIDUAL if name == RESIDUAL else RIGID, np.zeros(3))
-        return VarianceTerm(self._solved.get(name), float(np.sqrt(np.square(missed).mean())))
+        discrepancy = self._discrepancies.get(RESIDUAL if name == RESIDUAL else RIGID, np.zeros(3))
+        return VarianceTerm(self._solution_support.get(name), float(np.sqrt(np.square(discrepancy).mean())))
 
     def state(self) -> UncertaintyState:
         """Return everything needed to resume, except `arrays`."""
         return UncertaintyState(
             errors=self.errors,
-            judged=self._contest.pairs,
+            judged=self._comparison.pairs,
             trusted=self._trusted,
             residuals=self._residuals,
-            misfits={name: _triple(missed) for name, missed in self._misfits.items()},
-            misfits_before={name: _triple(missed) for name, missed in self._misfits_before.items()},
+            misfits={name: _triple(discrepancy) for name, discrepancy in self._discrepancies.items()},
+            misfits_before={name: _triple(discrepancy) for name, discrepancy in self._previous_discrepancies.items()},
             belief=None if self.belief is None else self.belief.to_bytes(),
             wide=None if self.wide is None else self.wide.to_bytes(),
             residual=None if self.residual is None else self.residual.to_bytes(),
@@ -355,7 +357,7 @@ class UncertaintyTracker:
     def arrays(self) -> dict[str, FloatArray]:
         """Return the configurations (n, d) [rad] that represent all data, and squared errors (k,) [m²] by model."""
         return {_SUPPORT: self._support.configurations} | {
-            _CONTEST + name: values.copy() for name, values in self._contest.errors.items()
+            _CONTEST + name: values.copy() for name, values in self._comparison.errors.items()
         }
 
     def restore(self, state: UncertaintyState, arrays: Mapping[str, FloatArray]) -> None:
@@ -363,15 +365,17 @@ class UncertaintyTracker:
         self._support.add(arrays[_SUPPORT])
         self.errors, self._residuals = dict(state.errors), state.residuals
         squares = {name.removeprefix(_CONTEST): v for name, v in arrays.items() if name.startswith(_CONTEST)}
-        self._contest = PrequentialComparison(squares, state.judged)
-        self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
+        self._comparison = PrequentialComparison(squares, state.judged)
+        self._discrepancies = {name: np.array(discrepancy) for name, discrepancy in state.misfits.items()}
         self._trusted = state.trusted
-        self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}
+        self._previous_discrepancies = {
+            name: np.array(discrepancy) for name, discrepancy in state.misfits_before.items()
+        }
         self.belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
         self.wide = None if state.wide is None else ChainBelief.from_bytes(state.wide)
         self.residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)
-        self._asked = self._support.view
-        self._solved = dict.fromkeys(self._misfits, self._asked)
+        self._requested_support = self._support.view
+        self._solution_support = dict.fromkeys(self._discrepancies, self._requested_support)
 
 
 def _triple(values: FloatArray) -> tuple[float, float, float]:
@@ -397,23 +401,23 @@ def model_discrepancy(
     """
     noise = np.broadcast_to(noise_variance, errors.shape)
     if scatter > 0.0:
-        near = _near(errors, scatter)
-        errors, noise = errors[near], noise[near]
+        inliers = _inliers(errors, scatter)
+        errors, noise = errors[inliers], noise[inliers]
     n = len(errors)
     if neighbours and n > 1:
         variance = (errors[1:] * errors[:-1]).mean(axis=0)
         chance = np.square(errors).mean(axis=0) / math.sqrt(n - 1)
     else:
         square = np.square(errors).mean(axis=0)
-        taken = max(scatter**2 / max(float(square.mean()), 1e-300), 1.0)
-        variance = taken * square - noise.mean(axis=0)
-        chance = np.sqrt(2.0 * taken * np.square(noise).mean(axis=0) / n)
-    seen = np.where(variance > ContestSettings.clearly * chance, variance, 0.0)
-    missing = max(UncertaintySettings.warm_pairs - n, 0.0)
-    return np.sqrt((n * seen + missing * np.square(before)) / max(n, UncertaintySettings.warm_pairs))
+        freedom_factor = max(scatter**2 / max(float(square.mean()), 1e-300), 1.0)
+        variance = freedom_factor * square - noise.mean(axis=0)
+        chance = np.sqrt(2.0 * freedom_factor * np.square(noise).mean(axis=0) / n)
+    discrepancy = np.where(variance > ContestSettings.clearly * chance, variance, 0.0)
+    prior_weight = max(UncertaintySettings.warm_pairs - n, 0.0)
+    return np.sqrt((n * discrepancy + prior_weight * np.square(before)) / max(n, UncertaintySettings.warm_pairs))
 
 
-def _near(errors: FloatArray, scatter: float) -> NDArray[np.bool_]:
+def _inliers(errors: FloatArray, scatter: float) -> NDArray[np.bool_]:
     """Return the mask of errors that the fit has not left out; all if these are the minority: then the fit is off."""
-    near = np.linalg.norm(errors, axis=1) <= RobustSettings.outlier_sigmas * scatter
-    return near if near.mean() > 0.5 else np.ones_like(near)
+    inliers = np.linalg.norm(errors, axis=1) <= RobustSettings.outlier_sigmas * scatter
+    return inliers if inliers.mean() > 0.5 else np.ones_like(inliers)

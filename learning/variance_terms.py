@@ -21,23 +21,25 @@ class QueryPoints:
     def __init__(self, q: FloatArray) -> None:
         self.q = q
         # Keyed by identity; the object is kept alive, so that no other gets its id.
-        self._left_open: dict[int, tuple[SupportSet, FloatArray]] = {}
+        self._unexplained_cache: dict[int, tuple[SupportSet, FloatArray]] = {}
         self._chains: dict[int, tuple[ChainBelief | ResidualModel, tuple[FloatArray, FloatArray]]] = {}
 
     def at(self, rows: IntArray) -> QueryPoints:
         """Return the configurations of some rows, with the results computed there."""
         part = QueryPoints(self.q[rows])
-        part._left_open = {k: (of, left[rows]) for k, (of, left) in self._left_open.items()}
-        part._chains = {k: (of, (x[rows], variance[rows])) for k, (of, (x, variance)) in self._chains.items()}
+        part._unexplained_cache = {
+            k: (source, unexplained_share[rows]) for k, (source, unexplained_share) in self._unexplained_cache.items()
+        }
+        part._chains = {k: (source, (x[rows], variance[rows])) for k, (source, (x, variance)) in self._chains.items()}
         return part
 
     def unexplained(self, support: SupportSet | None) -> FloatArray:
         """Return the result of the function of that name."""
         if support is None:
             return np.ones(len(self.q))
-        if id(support) not in self._left_open:
-            self._left_open[id(support)] = support, unexplained(support, self.q)
-        return self._left_open[id(support)][1]
+        if id(support) not in self._unexplained_cache:
+            self._unexplained_cache[id(support)] = support, unexplained(support, self.q)
+        return self._unexplained_cache[id(support)][1]
 
     def chain(self, belief: ChainBelief | ResidualModel) -> tuple[FloatArray, FloatArray]:
         """Return positions and the variance of each coordinate, both (n, 3) [m, m²]."""
@@ -53,9 +55,9 @@ class VarianceTerm:
     support: SupportSet | None  # support of the data; None without data
     sigma: float  # 1-sigma of a coordinate far from all data [m]
 
-    def variance(self, where: QueryPoints) -> FloatArray:
+    def variance(self, points: QueryPoints) -> FloatArray:
         """Return the variance of a coordinate at these points, shape (n, 1) [m²]."""
-        return where.unexplained(self.support)[:, None] * self.sigma**2
+        return points.unexplained(self.support)[:, None] * self.sigma**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +66,9 @@ class ChainTerm:
 
     belief: ChainBelief | ResidualModel
 
-    def variance(self, where: QueryPoints) -> FloatArray:
+    def variance(self, points: QueryPoints) -> FloatArray:
         """Return the variance of each coordinate at these points, shape (n, 3) [m²]."""
-        return where.chain(self.belief)[1]
+        return points.chain(self.belief)[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +79,10 @@ class DepartureTerm:
     belief: ChainBelief  # posterior of the chain
     support: SupportSet | None = None  # support of the model's own data; None without data
 
-    def variance(self, where: QueryPoints) -> FloatArray:
+    def variance(self, points: QueryPoints) -> FloatArray:
         """Return the squared difference of each coordinate at these points, shape (n, 3) [m²]."""
-        departure = self.predict(where.q) - where.chain(self.belief)[0]
-        return where.unexplained(self.support)[:, None] * np.square(departure)
+        departure = self.predict(points.q) - points.chain(self.belief)[0]
+        return points.unexplained(self.support)[:, None] * np.square(departure)
 
 
 def unexplained(support: SupportSet | None, q: FloatArray) -> FloatArray:

@@ -47,7 +47,7 @@ class ColumnLimits:
     longest_name = 200
 
 
-_MEND_ROW = "Fix or delete the row"
+_ROW_REMEDY = "Fix or delete the row"
 
 
 class Fault(Exception):
@@ -141,7 +141,7 @@ def check_finite(table: Table) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         value = table.values[row, column]
-        raise Fault(f"{value} is not a finite number", row=int(row), column=table.names[column], remedy=_MEND_ROW)
+        raise Fault(f"{value} is not a finite number", row=int(row), column=table.names[column], remedy=_ROW_REMEDY)
 
 
 def check_values(table: Table) -> None:
@@ -195,7 +195,7 @@ def _check_time(table: Table) -> None:
     )
 
 
-def _first(bad: BoolArray, what: Callable[[int], str], column: str, remedy: str = _MEND_ROW) -> None:
+def _first(bad: BoolArray, what: Callable[[int], str], column: str, remedy: str = _ROW_REMEDY) -> None:
     rows = np.flatnonzero(bad)
     if len(rows):
         raise Fault(what(int(rows[0])), row=int(rows[0]), column=column, remedy=remedy)

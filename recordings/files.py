@@ -76,7 +76,7 @@ def stored_pairs(file: Path) -> StoredPairs:
     with PairReader(file) as reader:
         pairs, damage = reader.read(), reader.audit().damage
         if damage.count:
-            log.warning("%s", damage.told(file))
+            log.warning("%s", damage.sentence(file))
         if not pairs:
             raise RecordingError("the store has no pairs", file=file, remedy="Move the arm in front of the camera")
         return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints, file), [pair.seq for pair in pairs])

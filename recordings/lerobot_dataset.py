@@ -19,7 +19,7 @@ from bodyschema.robot.lerobot import Calibrations, JointServo, Unit
 from bodyschema.robot.limited import FileLimits, bounded_memory, opened, read_at_most
 
 from .columns import ColumnLimits
-from .parquet_file import MOST_BYTES, arrow_modules
+from .parquet_file import MAX_BYTES, arrow_modules
 from .recording import Recording
 from .tracks import JointTrack, MarkerTrack, joined
 
@@ -131,7 +131,7 @@ def _table(folder: Path, columns: Sequence[str]) -> list[tuple[float, ...]]:
     (pyarrow, _), rows = arrow_modules(folder, _WHAT), list[tuple[float, ...]]()
     for file in sorted(folder.rglob("*.parquet")):
         try:
-            with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
+            with bounded_memory(FileLimits.memory_bytes), opened(file, MAX_BYTES) as stream:
                 table = pyarrow.parquet.ParquetFile(stream).read(columns=list(columns))
             numbers = np.column_stack([table.column(name).to_numpy().astype(np.float64) for name in columns])
             if not np.isfinite(numbers).all():
@@ -184,7 +184,7 @@ def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, n
     left = most = ColumnLimits.most_numbers // (len(names) + len(_COLUMNS) - 1)
     for file in files:
         try:
-            with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
+            with bounded_memory(FileLimits.memory_bytes), opened(file, MAX_BYTES) as stream:
                 parquet = pyarrow.parquet.ParquetFile(stream)
                 left -= parquet.metadata.num_rows
                 if left < 0:
@@ -199,8 +199,8 @@ def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, n
                 raise ValueError(f"row {int(np.argmin(finite)) + 1} has a number that is missing or not finite")
             episodes.append(numbers.astype(np.int64))
         except (pyarrow.ArrowException, AttributeError, KeyError, ValueError, TypeError, OSError) as error:
-            said = (getattr(error, "strerror", None) or str(error)).strip().split("\n")[0].rstrip(".")
-            raise RecordingError(f"is no data of a LeRobotDataset: {said}", file=file) from error
+            message = (getattr(error, "strerror", None) or str(error)).strip().split("\n")[0].rstrip(".")
+            raise RecordingError(f"is no data of a LeRobotDataset: {message}", file=file) from error
     if left == most:
         raise RecordingError("the dataset has no rows", file=source, remedy="Record an episode")
     return np.concatenate(states), np.concatenate(times), np.concatenate(episodes)

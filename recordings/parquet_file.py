@@ -16,7 +16,7 @@ from bodyschema.robot.limited import FileLimits, bounded_memory, opened
 
 from .columns import ColumnLimits, Fault, Table, check_finite, check_header, check_width
 
-MOST_BYTES = 2**30  # the largest number of values takes 0.8 GB
+MAX_BYTES = 2**30  # the largest number of values takes 0.8 GB
 INTEGER_COLUMNS = frozenset({"segment"})
 
 
@@ -77,7 +77,7 @@ def _check_rows(rows: int, most: int) -> None:
 def _opened(file: Path) -> Iterator[Any]:
     """Open the Parquet file; raise Fault if the content read inside the with block is damaged."""
     arrow, parquet = arrow_modules(file, "Parquet, unlike CSV,")
-    with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
+    with bounded_memory(FileLimits.memory_bytes), opened(file, MAX_BYTES) as stream:
         try:
             yield parquet.ParquetFile(stream)
         except (arrow.ArrowException, OSError, ValueError) as error:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.covariance import from_upper, upper_triangles
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from bodyschema.interfaces.whole_files import writing
+from bodyschema.interfaces.whole_files import raising_write_errors
 from bodyschema.robot.limited import UnfitFile
 
 from .columns import (
@@ -167,7 +167,7 @@ class Recording:
         Raises:
             RecordingError: the file cannot be written.
         """
-        with writing(file, RecordingError), file.open("w", encoding="utf-8", newline="\n") as out:
+        with raising_write_errors(file, RecordingError), file.open("w", encoding="utf-8", newline="\n") as out:
             self.write_csv_to(out)
 
     def write_csv_to(self, out: TextIO) -> None:
@@ -183,7 +183,7 @@ class Recording:
         Raises:
             RecordingError: the file cannot be written, or the extra `export` is not installed.
         """
-        with writing(file, RecordingError):
+        with raising_write_errors(file, RecordingError):
             write_parquet_table(file, self.to_table())
 
     def rows(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Recording:

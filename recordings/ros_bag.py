@@ -90,7 +90,7 @@ def read_images(source: Path, topic: str) -> Iterator[tuple[float, bytes]]:
     """
     with _opened(source) as bag:
         topics = [each for each, kind in bag.types.items() if kind == IMAGE]
-        for received, message in bag.messages(_asked(bag, topic, topics, "--video", IMAGE)):
+        for received, message in bag.messages(_require_topic(bag, topic, topics, "--video", IMAGE)):
             yield _stamp(message.header, received), message.data.tobytes()
 
 
@@ -116,11 +116,11 @@ class _Bag:
         for connection, received_ns, data in self.reader.messages(connections=connections):
             yield received_ns / _NANO, self.reader.deserialize(data, connection.msgtype)
 
-    def some(self, topic: str) -> Iterator[Any]:
+    def first_messages(self, topic: str) -> Iterator[Any]:
         for _, (_, message) in zip(range(_Settings.first_messages), self.messages(topic), strict=False):
             yield message
 
-    def wrong(self, what: str, remedy: str) -> RecordingError:
+    def error(self, what: str, remedy: str) -> RecordingError:
         counts = self.counts
         listed = ", ".join(f"{topic} ({kind}, {counts[topic]})" for topic, kind in sorted(self.types.items()))
         ended = remedy if remedy.endswith(("?", ".")) else f"{remedy}."
@@ -144,9 +144,9 @@ def _opened(source: Path) -> Iterator[_Bag]:
         remedy = "Record the topics of joints and marker alone, or cut the bag: `ros2 bag convert`"
         raise RecordingError(what, file=source, remedy=remedy) from error
     except Exception as error:  # for damaged bytes rosbags may raise anything
-        said = (str(error).strip() or type(error).__name__).split("\n")[0][: _Settings.most_said].rstrip(".")
+        message = (str(error).strip() or type(error).__name__).split("\n")[0][: _Settings.most_said].rstrip(".")
         remedy = "A bag whose recording was cut off: `ros2 bag reindex`; one of splits: name the folder"
-        raise RecordingError(f"the bag cannot be read: {said}", file=source, remedy=remedy) from error
+        raise RecordingError(f"the bag cannot be read: {message}", file=source, remedy=remedy) from error
 
 
 def _check_files(source: Path) -> None:
@@ -161,25 +161,27 @@ def _check_files(source: Path) -> None:
 
 
 def _joint_topic(bag: _Bag, joints: Sequence[str], topics: BagTopics) -> str:
-    wanted = {topics.names.get(joint, joint) for joint in joints}
+    required = {topics.names.get(joint, joint) for joint in joints}
     known = [topic for topic, kind in bag.types.items() if kind == JOINT_STATE]
     if topics.joints is not None:
-        known = [_asked(bag, topics.joints, known, "--joint-topic", JOINT_STATE)]
+        known = [_require_topic(bag, topics.joints, known, "--joint-topic", JOINT_STATE)]
     if not known:
-        raise bag.wrong(f"there is no topic of {JOINT_STATE}", "Record the topic with the robot's joints.")
-    said = {topic: {name for message in bag.some(topic) for name in message.name} for topic in known}
-    whole = [topic for topic in known if wanted <= said[topic]]
-    if len(whole) > 1:
-        raise bag.wrong(f"several topics have the joints: {', '.join(whole)}", "Give one of them with --joint-topic.")
-    if not whole:
-        best = max(known, key=lambda topic: len(wanted & said[topic]))
-        missing = sorted(wanted - said[best])
+        raise bag.error(f"there is no topic of {JOINT_STATE}", "Record the topic with the robot's joints.")
+    names_in = {topic: {name for message in bag.first_messages(topic) for name in message.name} for topic in known}
+    complete = [topic for topic in known if required <= names_in[topic]]
+    if len(complete) > 1:
+        raise bag.error(
+            f"several topics have the joints: {', '.join(complete)}", "Give one of them with --joint-topic."
+        )
+    if not complete:
+        best = max(known, key=lambda topic: len(required & names_in[topic]))
+        missing = sorted(required - names_in[best])
         raise RecordingError(
-            f"{best} says nothing of {', '.join(missing)}; it has {', '.join(sorted(said[best])) or 'no joints'}",
+            f"{best} says nothing of {', '.join(missing)}; it has {', '.join(sorted(names_in[best])) or 'no joints'}",
             file=bag.source,
             remedy="Correct [robot] joints, or name them in [drivers.ros2.names] of robot.toml",
         )
-    return whole[0]
+    return complete[0]
 
 
 def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
@@ -187,7 +189,7 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
     known = [topic for topic, kind in kinds.items() if kind in _MARKERS]
     tf = [topic for topic, kind in kinds.items() if kind == TF and bag.counts[topic]]
     if topics.marker is not None:
-        topic = _asked(bag, topics.marker, [*known, *tf], "--marker-topic", "positions")
+        topic = _require_topic(bag, topics.marker, [*known, *tf], "--marker-topic", "positions")
         known, tf = [topic] if topic in known else [], [topic] if topic in tf else []
     if topics.frame is not None:
         seen = {topic: _frames(bag, topic, topics.frame) for topic in tf}
@@ -195,14 +197,14 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
         if leading:
             return min(leading, key=lambda topic: topic.endswith("static"))
         frames = sorted({child for pairs in seen.values() for _, child in pairs})
-        raise bag.wrong(
+        raise bag.error(
             f"no transform leads to the frame {topics.frame!r}; there are {', '.join(frames) or 'none'}",
             f"Correct --marker-frame. {did_you_mean(topics.frame, frames)}" if frames else "Record /tf.",
         )
     if len(known) == 1:
         return known[0]
     if known:
-        raise bag.wrong(f"several topics have positions: {', '.join(known)}", "Give the marker's with --marker-topic.")
+        raise bag.error(f"several topics have positions: {', '.join(known)}", "Give the marker's with --marker-topic.")
     if tf:
         pairs = sorted({pair for topic in tf for pair in _frames(bag, topic)})
         listed = ", ".join(f"{child} in {parent}" for parent, child in pairs)
@@ -211,26 +213,26 @@ def _marker_topic(bag: _Bag, topics: BagTopics) -> str:
             file=bag.source,
             remedy="Give it with --marker-frame; its parent has to be the camera's frame",
         )
-    raise bag.wrong(
+    raise bag.error(
         "there is no topic with positions of a marker",
         "Record PointStamped, PoseStamped, TransformStamped or TF of it; or give --markers FILE.csv, or --video and "
         "the topic of its camera's compressed images.",
     )
 
 
-def _frames(bag: _Bag, topic: str, wanted: str | None = None) -> set[tuple[str, str]]:
-    """Return parent and child of the transforms on a topic, of all messages or until the child `wanted` comes."""
+def _frames(bag: _Bag, topic: str, child_frame: str | None = None) -> set[tuple[str, str]]:
+    """Return parent and child of the transforms on a topic, of all messages or until the child `child_frame` comes."""
     found: set[tuple[str, str]] = set()
     for _, message in bag.messages(topic):
         found |= {(transform.header.frame_id, _child(transform)) for transform in message.transforms}
-        if any(child == wanted for _, child in found):
+        if any(child == child_frame for _, child in found):
             break
     return found
 
 
-def _asked(bag: _Bag, topic: str, known: Sequence[str], option: str, what: str) -> str:
+def _require_topic(bag: _Bag, topic: str, known: Sequence[str], option: str, what: str) -> str:
     if topic not in known:
-        raise bag.wrong(f"{option} {topic}: there is no such topic of {what}", did_you_mean(topic, known or [topic]))
+        raise bag.error(f"{option} {topic}: there is no such topic of {what}", did_you_mean(topic, known or [topic]))
     return topic
 
 

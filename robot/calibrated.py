@@ -22,7 +22,7 @@ from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
 from .description import RobotDescription
-from .urdf import UrdfJoint, inverse, joint_motion, standing
+from .urdf import UrdfJoint, fixed_transform, inverse, joint_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,37 +44,37 @@ class CalibratedGeometry:
             T_measured_nominal: camera displacement (4, 4), as in `kbmaps.ChainReport`.
             zeros: joint offsets (d,) [rad, m], as in `kbmaps.ChainReport`.
         """
-        way = _Way.of(robot)
+        path = _KinematicPath.of(robot)
         joints = zip(chain.axes, chain.prismatic, zeros, strict=True)
         at_zero = [joint_motion(axis, bool(prismatic), value) for axis, prismatic, value in joints]
         # Frames of the joints and the marker, with all joints at zero, in the nominal measurement frame.
         moved = [inverse(zero) @ fixed for zero, fixed in zip(at_zero, chain.fixed[1:], strict=True)]
         frames = _frames([inverse(T_measured_nominal) @ chain.fixed[0], *moved])
-        drawn = _frames(robot.chain.fixed)
+        nominal_frames = _frames(robot.chain.fixed)
         T_camera_parent = T_measured_nominal @ inverse(robot.camera.pose)
-        if way.upward[0]:
-            T_camera_parent = chain.fixed[0] @ inverse(way.between[0])
+        if path.upward[0]:
+            T_camera_parent = chain.fixed[0] @ inverse(path.between[0])
         # The pose reached on the path, with all joints at zero and before the camera has moved. On an upward path, the
         # link above a joint is that of the next joint if its path leads up too; the topmost keeps its nominal pose.
-        reached = inverse(T_measured_nominal) @ T_camera_parent @ way.between[0]
+        reached = inverse(T_measured_nominal) @ T_camera_parent @ path.between[0]
         origins: dict[str, FloatArray] = {}
-        for k, joint in enumerate(way.joints):
-            if not way.upward[k]:
+        for k, joint in enumerate(path.joints):
+            if not path.upward[k]:
                 origins[joint.name] = inverse(reached) @ frames[k] @ at_zero[k]
-                reached = frames[k] @ way.between[k + 1]
+                reached = frames[k] @ path.between[k + 1]
                 continue
-            if k + 1 < len(way.joints) and way.upward[k + 1]:
-                T_zero_parent = frames[k + 1] @ inverse(way.between[k + 1])
+            if k + 1 < len(path.joints) and path.upward[k + 1]:
+                T_zero_parent = frames[k + 1] @ inverse(path.between[k + 1])
             else:
-                T_zero_parent = drawn[k] @ inverse(joint.T_parent_joint)
+                T_zero_parent = nominal_frames[k] @ inverse(joint.T_parent_joint)
             origins[joint.name] = inverse(T_zero_parent) @ frames[k] @ inverse(at_zero[k])
-            reached = T_zero_parent @ way.between[k + 1]
+            reached = T_zero_parent @ path.between[k + 1]
         marker = inverse(reached) @ frames[-1]
         return cls(origins, inverse(T_camera_parent), marker[:3, 3])
 
 
 @dataclass(frozen=True)
-class _Way:
+class _KinematicPath:
     """Path from the camera's link to the marker's: learnt joints (d), and fixed transforms between them (d+1)."""
 
     joints: list[UrdfJoint]
@@ -83,16 +83,16 @@ class _Way:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> Self:
-        way = cls([], [], [np.eye(4)])
+        path = cls([], [], [np.eye(4)])
         for joint, upward in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link):
             if joint.name in robot.joints:
-                way.joints.append(joint)
-                way.upward.append(upward)
-                way.between.append(np.eye(4))
+                path.joints.append(joint)
+                path.upward.append(upward)
+                path.between.append(np.eye(4))
             else:
                 held = robot.robot.held_at.get(joint.name, 0.0)
-                way.between[-1] = way.between[-1] @ standing(joint, upward, held)
-        return way
+                path.between[-1] = path.between[-1] @ fixed_transform(joint, upward, held)
+        return path
 
 
 def _frames(transforms: Iterable[FloatArray]) -> list[FloatArray]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import write_whole, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, write_atomically
 
 from .calibrated import CalibratedGeometry
 from .description import RobotDescription
@@ -60,14 +60,14 @@ def write_calibrated(
         urdf: calibrated_urdf(robot, geometry, folder, heading),
         toml: f"# {heading}\n\n{toml_text(_tables(robot, geometry, folder))}".encode(),
     }
-    with writing(folder, remedy="Give another folder"):
+    with raising_write_errors(folder, remedy="Give another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         for file in texts:
             own = file.exists() and any(file.samefile(read) for read in (robot.file, robot.tree.file))
             if own or (file.exists() and not replace):
                 remedy = "Give another folder" if own else "Give another folder, or --force"
                 raise ConfigError("is there already", file=file, remedy=remedy)
-        write_whole(texts)
+        write_atomically(texts)
     return toml
 
 

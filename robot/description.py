@@ -22,7 +22,7 @@ from kbmaps import RigidChain
 
 from .rpy import pose_of, rpy_of
 from .toml_file import NAME, Positive, convert, line_of, read_toml
-from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between, motions
+from .urdf import MOVING, UrdfJoint, UrdfTree, chain_between, joint_transforms
 
 Vector3 = tuple[float, float, float]
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE_PX)]
@@ -272,6 +272,8 @@ def link_poses(robot: RobotDescription, q: FloatArray) -> dict[str, FloatArray]:
     for link in (open_ := list(poses)):  # grows during the loop
         for joint in below[link]:
             held = np.full(len(q), robot.robot.held_at.get(joint.name, 0.0))
-            poses[joint.child] = poses[link] @ joint.T_parent_joint @ motions(joint, columns.get(joint.name, held))
+            poses[joint.child] = (
+                poses[link] @ joint.T_parent_joint @ joint_transforms(joint, columns.get(joint.name, held))
+            )
             open_.append(joint.child)
     return poses

@@ -140,13 +140,13 @@ def write_launch_file(pose: HandEye, folder: Path) -> Path:
     Raises:
         ConfigError: it cannot be written.
     """
-    from bodyschema.interfaces.whole_files import write_whole, writing
+    from bodyschema.interfaces.whole_files import raising_write_errors, write_atomically
 
     file = folder / LAUNCH
     arguments = _arguments(pose.translation_m, pose.quaternion_xyzw, pose.parent, pose.child)
     text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
-    with writing(file, remedy="Give another folder"):
-        write_whole({file: text.encode()})
+    with raising_write_errors(file, remedy="Give another folder"):
+        write_atomically({file: text.encode()})
     return file
 
 

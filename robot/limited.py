@@ -43,11 +43,11 @@ def check_regular(file: Path) -> None:
 
 
 @contextmanager
-def opened(file: Path, most: int) -> Iterator[BinaryIO]:
+def opened(file: Path, max_bytes: int) -> Iterator[BinaryIO]:
     """Open a regular file for reading.
 
     Args:
-        most: largest plausible size of its kind [bytes].
+        max_bytes: largest plausible size of its kind [bytes].
 
     Raises:
         UnfitFile: it is larger, or a device, a pipe or a socket.
@@ -57,33 +57,33 @@ def opened(file: Path, most: int) -> Iterator[BinaryIO]:
     with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
         state = os.fstat(stream.fileno())
         _require_regular(state.st_mode)
-        if state.st_size > most:
-            raise _too_large(most)
+        if state.st_size > max_bytes:
+            raise _too_large(max_bytes)
         yield stream
 
 
-def read_at_most(file: Path, most: int = FileLimits.text_bytes) -> bytes:
+def read_at_most(file: Path, max_bytes: int = FileLimits.text_bytes) -> bytes:
     """Return the bytes of a regular file. Raise the errors of `opened`."""
     data = bytearray()
-    with opened(file, most) as stream:
+    with opened(file, max_bytes) as stream:
         while piece := stream.read(io.DEFAULT_BUFFER_SIZE):  # files of /proc report no size
             data += piece
-            if len(data) > most:
-                raise _too_large(most)
+            if len(data) > max_bytes:
+                raise _too_large(max_bytes)
     return bytes(data)
 
 
 @contextmanager
-def bounded_memory(most: int) -> Iterator[None]:
-    """Limit a library that unpacks a file to `most` bytes of additional memory, and to files of as many bytes.
+def bounded_memory(max_bytes: int) -> Iterator[None]:
+    """Limit a library that unpacks a file to `max_bytes` bytes of additional memory, and to files of as many bytes.
 
     Beyond that, allocations fail in the whole process, with MemoryError or the library's own error. A lower existing
     limit stays. If the system does not report sizes, memory is not limited.
     """
-    limits = {resource.RLIMIT_FSIZE: most}
+    limits = {resource.RLIMIT_FSIZE: max_bytes}
     try:
         with open("/proc/self/statm", "rb") as stream:
-            limits[resource.RLIMIT_AS] = int(stream.read().split()[0]) * resource.getpagesize() + most
+            limits[resource.RLIMIT_AS] = int(stream.read().split()[0]) * resource.getpagesize() + max_bytes
     except OSError:
         pass
     with ExitStack() as undo:
@@ -103,6 +103,6 @@ def _require_regular(mode: int) -> None:
             raise UnfitFile(errno.EINVAL, what)
 
 
-def _too_large(most: int) -> UnfitFile:
-    size = f"{most // 2**30} GiB" if most >= 2**30 else f"{most // 2**20} MiB"
+def _too_large(max_bytes: int) -> UnfitFile:
+    size = f"{max_bytes // 2**30} GiB" if max_bytes >= 2**30 else f"{max_bytes // 2**20} MiB"
     return UnfitFile(errno.EFBIG, f"larger than {size}")

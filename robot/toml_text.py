@@ -12,7 +12,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.whole_files import replace_kept, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, replace_with_backup
 
 from .toml_file import read_toml
 
@@ -83,5 +83,5 @@ def write_edited(file: Path, edited: str) -> Path:
     Raises:
         ConfigError: nothing could be written.
     """
-    with writing(file):
-        return replace_kept(file, edited.encode())
+    with raising_write_errors(file):
+        return replace_with_backup(file, edited.encode())

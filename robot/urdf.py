@@ -174,38 +174,38 @@ def chain_between(
     Raises:
         RobotError: a joint does not lie between the links, or their order along the path differs.
     """
-    way = tree.path(start, end)
-    mimicking = next((joint for joint, _ in way if joint.mimics), None)
+    path = tree.path(start, end)
+    mimicking = next((joint for joint, _ in path if joint.mimics), None)
     if mimicking is not None:
         raise RobotError(
             f"joint {mimicking.name!r} mimics another joint", file=tree.file, remedy="Replace it by a fixed joint"
         )
-    on_way = [joint.name for joint, _ in way if joint.name in joints]
+    on_path = [joint.name for joint, _ in path if joint.name in joints]
     for name in joints:
         tree.joint(name)
-        if name not in on_way:
-            movable = ", ".join(joint.name for joint, _ in way if joint.kind in MOVING) or "none"
+        if name not in on_path:
+            movable = ", ".join(joint.name for joint, _ in path if joint.kind in MOVING) or "none"
             raise RobotError(
                 f"joint {name!r} does not move the marker: it is not between the links {start!r} and {end!r}",
                 remedy=f"Take it out of joints (between them are: {movable})",
             )
-    if tuple(on_way) != joints:
+    if tuple(on_path) != joints:
         raise RobotError(
             f"joints are not in the order in which they follow from {start!r} to {end!r}",
-            remedy=f"Write joints = {list(on_way)}",
+            remedy=f"Write joints = {list(on_path)}",
         )
-    return _assemble(way, joints, held_at, inverse(T_start_camera), marker_xyz)
+    return _assemble(path, joints, held_at, inverse(T_start_camera), marker_xyz)
 
 
 def _assemble(
-    way: list[tuple[UrdfJoint, bool]],
+    path: list[tuple[UrdfJoint, bool]],
     joints: tuple[str, ...],
     held_at: dict[str, float],
     T_camera_start: FloatArray,
     marker_xyz: FloatArray,
 ) -> RigidChain:
     fixed, axes, prismatic = [T_camera_start], [], []
-    for joint, upward in way:
+    for joint, upward in path:
         T_joint_parent = inverse(joint.T_parent_joint)
         if joint.name in joints:
             if not upward:
@@ -214,7 +214,7 @@ def _assemble(
             axes.append(-joint.axis if upward else joint.axis)
             prismatic.append(joint.kind == "prismatic")
             continue
-        fixed[-1] = fixed[-1] @ standing(joint, upward, held_at.get(joint.name, 0.0))
+        fixed[-1] = fixed[-1] @ fixed_transform(joint, upward, held_at.get(joint.name, 0.0))
     tool = np.eye(4)
     tool[:3, 3] = marker_xyz
     fixed[-1] = fixed[-1] @ tool
@@ -223,13 +223,13 @@ def _assemble(
     )
 
 
-def standing(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
+def fixed_transform(joint: UrdfJoint, upward: bool, position: float) -> FloatArray:
     """Return the transform (4, 4) across a joint that is held at `position` [rad or m]."""
-    T_parent_child = joint.T_parent_joint @ motions(joint, np.array([position]))[0]
+    T_parent_child = joint.T_parent_joint @ joint_transforms(joint, np.array([position]))[0]
     return inverse(T_parent_child) if upward else T_parent_child
 
 
-def motions(joint: UrdfJoint, positions: FloatArray) -> FloatArray:
+def joint_transforms(joint: UrdfJoint, positions: FloatArray) -> FloatArray:
     """Return the transforms (n, 4, 4) of a joint's motion at positions (n,) [rad or m]."""
     T = np.tile(np.eye(4), (len(positions), 1, 1))
     moved = positions[:, None] * joint.axis

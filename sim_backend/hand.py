@@ -70,7 +70,7 @@ class GuidePath:
         self._unvisited = list(range(1, len(self.waypoints)))
         self._at = self._before = self.waypoints[0]
         self._next = self._choose(self._at)
-        self._left_over = 0.0
+        self._remaining_length = 0.0
 
     def hop(self) -> FloatArray:
         """Return the postures (n, d) on the way to the next waypoint; n is 0 if it is nearer than a step."""
@@ -85,7 +85,7 @@ class GuidePath:
         self.waypoints = self._visible_postures()
         self._unvisited = list(range(len(self.waypoints)))
         self._at = self._before = posture
-        self._left_over = 0.0
+        self._remaining_length = 0.0
         self._next = self._choose(posture)
 
     def _curve(self, start: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
@@ -104,9 +104,9 @@ class GuidePath:
         """Return postures one step apart along a polyline; the rest at its end is carried over to the next hop."""
         lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(lengths)])
-        count = int((along[-1] + self._left_over) / self._step)
-        wanted = self._step * np.arange(1, count + 1) - self._left_over
-        self._left_over += along[-1] - self._step * count
+        count = int((along[-1] + self._remaining_length) / self._step)
+        wanted = self._step * np.arange(1, count + 1) - self._remaining_length
+        self._remaining_length += along[-1] - self._step * count
         return np.column_stack([np.interp(wanted, along, column) for column in points.T])
 
     def _choose(self, start: FloatArray) -> FloatArray:

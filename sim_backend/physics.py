@@ -39,14 +39,14 @@ class JointPaths:
     def __init__(self, truth: TrueRobot, rate_hz: int, camera_hz: int, *, begins: float) -> None:
         self._truth, self._begins = truth, begins
         latency = truth.beyond.latency_s
-        self._late, self._early = max(latency, 0.0) * rate_hz, max(-latency, 0.0) * rate_hz
+        self._frame_delay_steps, self._reading_delay_steps = max(latency, 0.0) * rate_hz, max(-latency, 0.0) * rate_hz
         self._frame_steps = rate_hz // camera_hz
         self._live = LiveEncoders(truth.beyond, self._frame_steps)
-        longest = max(self._late + self._frame_steps, self._early)
-        self._past: deque[FloatArray] = deque(maxlen=ceil(longest) + 3)
+        longest = max(self._frame_delay_steps + self._frame_steps, self._reading_delay_steps)
+        self._history: deque[FloatArray] = deque(maxlen=ceil(longest) + 3)
         self._t = 0.0
         self._unloaded = np.zeros(0)
-        self._hung: dict[Identity, float] = {}
+        self._flanks: dict[Identity, float] = {}
 
     @property
     def plain(self) -> bool:
@@ -55,39 +55,39 @@ class JointPaths:
 
     def record(self, angles: FloatArray, t: float) -> None:
         """Record the drive positions `angles` (d,) [rad or m] at the time t [s], one step after the last record."""
-        self._past.append(angles)
+        self._history.append(angles)
         self._t = t
         if not self.plain:
-            q = self._ago(self._late)
-            move = q - self._ago(self._late + self._frame_steps)
+            q = self._angles_before(self._frame_delay_steps)
+            move = q - self._angles_before(self._frame_delay_steps + self._frame_steps)
             offsets = self._truth.offsets
             self._unloaded = self._live.true_angles(q + offsets, t, move) - offsets
 
     @property
     def read(self) -> FloatArray:
         """Drive positions (d,) [rad or m] that the encoders sample now, without the joint offsets."""
-        return self._ago(self._early)
+        return self._angles_before(self._reading_delay_steps)
 
     @property
     def seen(self) -> FloatArray:
         """True joint angles (d,) [rad or m] in a frame taken now."""
         if self.plain:
-            return self._past[-1]
-        return self._unloaded + self._truth.beyond.given_way(self._unloaded[None], self._hung)[0]
+            return self._history[-1]
+        return self._unloaded + self._truth.beyond.deflections(self._unloaded[None], self._flanks)[0]
 
     @property
     def row(self) -> Motion:
         """Exact encoder readings at the time of a frame taken now, one row."""
         return Motion.at(self.read + self._truth.offsets, self._t, self._begins)
 
-    def _ago(self, steps: float) -> FloatArray:
+    def _angles_before(self, steps: float) -> FloatArray:
         """Return the drive positions `steps` steps ago, by a parabola through three steps; at first, the oldest."""
         if steps == 0.0:
-            return self._past[-1]
-        middle = min(max(round(steps), 1), len(self._past) - 2)
-        if middle < 1 or steps > len(self._past) - 1:
-            return self._past[0]
-        after, at, before = (self._past[-1 - k] for k in (middle - 1, middle, middle + 1))
+            return self._history[-1]
+        middle = min(max(round(steps), 1), len(self._history) - 2)
+        if middle < 1 or steps > len(self._history) - 1:
+            return self._history[0]
+        after, at, before = (self._history[-1 - k] for k in (middle - 1, middle, middle + 1))
         s = steps - middle
         return at + 0.5 * s * (before - after) + 0.5 * s * s * (before - 2.0 * at + after)
 
@@ -196,10 +196,10 @@ class Physics:
 
     def step(self) -> None:
         """Advance by one time step."""
-        if self._next == len(self._postures):
+        if self._next_posture == len(self._postures):
             self._plan(self._postures[-1])
-        self._hand.pull(self._goals, self._next)
-        self._next += 1
+        self._hand.pull(self._goals, self._next_posture)
+        self._next_posture += 1
         self._arm.step(self._command - self._truth.offsets[self._gazing])
         self.steps += 1
         self._paths.record(self.body.angles(), self.steps / self.rate_hz)
@@ -221,7 +221,7 @@ class Physics:
         self.marker_xyz = marker_xyz
         self._gaze.hold_tool(marker_xyz)
         self.sight.hold_tool(marker_xyz)
-        here = self._postures[self._next - 1]
+        here = self._postures[self._next_posture - 1]
         self._path.replan(here)
         self._plan(here)
 
@@ -232,4 +232,4 @@ class Physics:
             hop = self._path.hop()
         self._postures = np.vstack([posture, hop])
         self._goals = self._hand.goals(self._postures)
-        self._next = 1
+        self._next_posture = 1

@@ -112,10 +112,10 @@ class _Writer:
             self._add_joint(robot, joint)
         _add_world(robot, tree.root)
         files, coarser = self._meshes.files()
-        self._drop_vanished(robot, files)
-        said = tuple(sentence for sentence in (*self._said(), coarser) if sentence)
+        self._drop_missing_meshes(robot, files)
+        notes = tuple(sentence for sentence in (*self._notes(), coarser) if sentence)
         ElementTree.indent(robot)  # pybullet breaks lines of more than 8 KiB at any place
-        return PhysicsUrdf(ElementTree.tostring(robot, encoding="unicode"), files, said)
+        return PhysicsUrdf(ElementTree.tostring(robot, encoding="unicode"), files, notes)
 
     def _add_link(self, robot: ElementTree.Element, source: ElementTree.Element) -> None:
         name = source.attrib["name"]
@@ -210,7 +210,7 @@ class _Writer:
             limits = {"lower": repr(joint.lower), "upper": repr(joint.upper), "effort": "1000", "velocity": "10"}
             ElementTree.SubElement(element, "limit", limits)
 
-    def _drop_vanished(self, robot: ElementTree.Element, files: dict[str, bytes]) -> None:
+    def _drop_missing_meshes(self, robot: ElementTree.Element, files: dict[str, bytes]) -> None:
         """Drop the shapes of meshes that have no triangles left after simplification: screws."""
         for link in robot.iterfind("link"):
             for shape in link.findall("visual"):
@@ -218,7 +218,7 @@ class _Writer:
                 if mesh is not None and mesh.get("filename") not in files:
                     link.remove(shape)
 
-    def _said(self) -> Iterator[str]:
+    def _notes(self) -> Iterator[str]:
         drawn = f", and draws rods for {first_few(sorted(self._rods))}" if self._rods else ""
         meshes = self._meshes
         if meshes.missing:
@@ -240,7 +240,7 @@ class Meshes(MeshSet):
 
     def __init__(self, urdf: Path) -> None:
         super().__init__(urdf, UrdfSettings.most_triangles)
-        self._drawn: list[int] = []
+        self._visual_numbers: list[int] = []
 
     def add(self, name: str, scale: tuple[float, ...], *, drawn: bool) -> str | None:
         """Return the name of the file that will show the mesh `name`, or its hull; None if it cannot be used.
@@ -253,18 +253,18 @@ class Meshes(MeshSet):
         if number is None:
             return None
         if drawn:
-            self._drawn.append(number)
+            self._visual_numbers.append(number)
         return f"{'drawn' if drawn else 'hull'}_{number}.stl"
 
     def files(self) -> tuple[dict[str, bytes], str]:
         """Return the files by name, and a sentence on their simplification, if any."""
-        drawn, before = self.coarser(self._drawn)
+        drawn, before = self.coarser(self._visual_numbers)
         files = {}
         for number, triangles in enumerate(self.shapes):
             if len(drawn.get(number, ())):
                 files[f"drawn_{number}.stl"] = stl_bytes(drawn[number])
             files[f"hull_{number}.stl"] = stl_bytes(_hull(triangles))
-        count = sum(len(drawn[number]) for number in self._drawn)
+        count = sum(len(drawn[number]) for number in self._visual_numbers)
         coarser = f"the meshes have {before:,} triangles. To be quick, the simulation draws the robot with {count:,}"
         return files, coarser if count < before else ""
 

@@ -64,7 +64,7 @@ class PosedWorld:
         self._postures = frozen_array(postures)
         self._fetching = threading.Lock()
         self._exit = ExitStack()
-        self._read = self._asked = self._delivered = 0
+        self._read = self._requested = self._delivered = 0
 
     def __enter__(self) -> Self:
         self._calibration = calibration = stereo_calibration(self.robot)
@@ -78,7 +78,7 @@ class PosedWorld:
             self._postures, _Settings.period_s * np.arange(1.0, count + 1.0), np.zeros(count, dtype=np.int64)
         )
         unloaded = beyond.unloaded(motion) - self._truth.offsets
-        self._angles = unloaded + beyond.given_way(unloaded)  # true ones (n, d) [rad or m]
+        self._angles = unloaded + beyond.deflections(unloaded)  # true ones (n, d) [rad or m]
         urdf = physics_urdf(self._truth)
         for sentence in urdf.said:
             log.warning("%s", sentence)
@@ -137,9 +137,9 @@ class PosedWorld:
             return stereo_frame(self.now(), images)
 
     def _ask_ahead(self) -> None:
-        while self._asked < min(self._delivered + _Settings.ahead, len(self._postures)):
-            self._renderer.request(self._asked, self.scene(self._asked))
-            self._asked += 1
+        while self._requested < min(self._delivered + _Settings.ahead, len(self._postures)):
+            self._renderer.request(self._requested, self.scene(self._requested))
+            self._requested += 1
 
     def scene(self, number: int) -> Scene:
         """Return the scene of the frame of posture `number`."""

@@ -117,9 +117,9 @@ class Sight:
         border = _Settings.margin_px + self._calibration.focal_px * self._radius / deep
         size = np.tile(self._calibration.image_size_px, 2)
         inside = ((pixels > border[:, None]) & (pixels < size - 1 - border[:, None])).all(axis=1)
-        return inside & (x[:, 2] > _Settings.nearest_m) & (x[:, 2] < _Settings.farthest_m) & self._faced(T)
+        return inside & (x[:, 2] > _Settings.nearest_m) & (x[:, 2] < _Settings.farthest_m) & self._faces_camera(T)
 
-    def _faced(self, T: FloatArray) -> np.ndarray:
+    def _faces_camera(self, T: FloatArray) -> np.ndarray:
         """Return a mask (n,) of the marker's poses (n, 4, 4) with a tag that faces the midpoint between the eyes."""
         if not len(self._facing):
             return np.ones(len(T), dtype=bool)

@@ -41,8 +41,8 @@ class TrueRobot:
         extension = Simulation(robot) if extension is None else extension
         rng = generator(config.seed, Stream.ERRORS)
         errors = config.errors
-        way = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
-        moving = [name for name in way if robot.tree.joints[name].kind in MOVING]
+        path = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
+        moving = [name for name in path if robot.tree.joints[name].kind in MOVING]
         offsets: dict[str, float] = {}
         metres_per_radian = 0.1  # the offset of a prismatic joint is known better than that of a revolute one
         for name in moving:
@@ -70,7 +70,9 @@ class TrueRobot:
                 joints[name] = _locked(joint, held_at)
         return cls(
             robot=robot,
-            beyond=extension.with_effects(_bent(extension.effects)).with_background(_bent(extension.background)),
+            beyond=extension.with_effects(_beyond_rigid(extension.effects)).with_background(
+                _beyond_rigid(extension.background)
+            ),
             tree=replace(robot.tree, joints=joints),
             offsets=frozen_array([offsets[name] for name in robot.joints]),
             T_parent_camera=frozen_array(robot.camera.pose @ extension.camera_pose @ camera_error),
@@ -78,7 +80,7 @@ class TrueRobot:
             tool_turn=frozen_array(tool_turn),
         )
 
-    def true_eyes(self, calibration: StereoCalibration) -> StereoCalibration:
+    def true_calibration(self, calibration: StereoCalibration) -> StereoCalibration:
         """Return the described calibration with the true baseline."""
         return replace(calibration, baseline_m=calibration.baseline_m / (1.0 + self.beyond.optics.scale_error))
 
@@ -111,7 +113,7 @@ def with_offsets(chain: RigidChain, offsets: FloatArray) -> RigidChain:
     return RigidChain(fixed=fixed, axes=chain.axes, prismatic=chain.prismatic)
 
 
-def _bent(effects: Iterable[Effect]) -> list[Effect]:
+def _beyond_rigid(effects: Iterable[Effect]) -> list[Effect]:
     """Return the effects that no tree of rigid links can represent."""
     return [effect for effect in effects if not effect.kind.rigid]
 
@@ -143,8 +145,8 @@ class JointRoles:
     @classmethod
     def of(cls, robot: RobotDescription) -> JointRoles:
         """Return the roles of a robot's learnt joints."""
-        way = robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)
-        upward = {joint.name: up for joint, up in way}
+        path = robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)
+        upward = {joint.name: is_upward for joint, is_upward in path}
         index = {name: k for k, name in enumerate(robot.joints)}
         gaze = tuple(k for name, k in index.items() if upward[name])
         guided = tuple(k for name, k in index.items() if not upward[name])
@@ -154,16 +156,16 @@ class JointRoles:
         # The joint nearest to half the arm's length, with all joints at zero.
         links = [*(robot.tree.joints[robot.joints[k]].child for k in guided), wrist]
         origins = np.array([_origin(robot.tree, link) for link in links])
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
-        elbow = links[int(np.abs(along[:-1] - along[-1] / 2).argmin())]
+        distances = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
+        elbow = links[int(np.abs(distances[:-1] - distances[-1] / 2).argmin())]
         return cls(gaze=gaze, guided=guided, wrist=wrist, elbow=elbow)
 
 
 def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[RigidChain, tuple[int, ...]]:
     """Return the true chain from the root to a guided link, over reported angles, and its joints' indices in q."""
     root = truth.tree.root
-    on_way = {joint.name for joint, _ in truth.tree.path(root, link)}
-    indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_way)
+    on_path = {joint.name for joint, _ in truth.tree.path(root, link)}
+    indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_path)
     names = tuple(truth.robot.joints[k] for k in indices)
     chain = chain_between(truth.tree, names, {}, start=root, end=link, T_start_camera=np.eye(4), marker_xyz=np.zeros(3))
     return with_offsets(chain, truth.offsets[list(indices)]), indices

@@ -72,9 +72,9 @@ class SimWorld:
         self._readings: deque[JointReading] = deque()
         self._frame_times: deque[float] = deque()
         self._planned = deque(sorted(config.tool_changes, key=lambda change: change.at_s))
-        self._wanted_tool: FloatArray | None = None
+        self._requested_tool: FloatArray | None = None
         self._joints_open = self._camera_open = self._running = False
-        self._taken = self._delivered = 0
+        self._frames_taken = self._delivered = 0
 
     def __enter__(self) -> Self:
         calibration = stereo_calibration(self.robot)
@@ -113,7 +113,7 @@ class SimWorld:
             Simulated time [s]: all frames after it show the new tool.
         """
         with self._moved:
-            self._wanted_tool = np.array(marker_xyz, dtype=np.float64)
+            self._requested_tool = np.array(marker_xyz, dtype=np.float64)
             return self.now()
 
     def true_chain(self) -> RigidChain:
@@ -122,7 +122,7 @@ class SimWorld:
         It includes only those effects of `extension` that a rigid chain can represent.
         """
         with self._moved:
-            wanted = self._physics.marker_xyz if self._wanted_tool is None else self._wanted_tool
+            wanted = self._physics.marker_xyz if self._requested_tool is None else self._requested_tool
             return self._truth.chain(wanted)
 
     def true_turn(self) -> FloatArray:
@@ -142,7 +142,7 @@ class SimWorld:
             if is_open and self._renderer.process.poll() is not None:  # the frames in progress are lost
                 self._renderer.__exit__(None, None, None)
                 self._renderer.__enter__()
-                self._delivered = self._taken
+                self._delivered = self._frames_taken
                 self._frame_times.clear()
             self._camera_open = is_open
             self._moved.notify_all()
@@ -191,7 +191,7 @@ class SimWorld:
             return True
 
     def _may_take_frame(self) -> bool:
-        return not self._camera_open or self._taken - self._delivered < _Settings.frames_ahead
+        return not self._camera_open or self._frames_taken - self._delivered < _Settings.frames_ahead
 
     def _check_open(self, is_open: bool) -> None:
         if not self._running:
@@ -211,18 +211,18 @@ class SimWorld:
                 self._readings.append(JointReading(t, frozen_array(q)))
                 self.stats.readings += 1
         if self._camera_open and physics.steps % (physics.rate_hz // self.config.camera.rate_hz) == 0:
-            self._renderer.request(self._taken, physics.scene())
+            self._renderer.request(self._frames_taken, physics.scene())
             self._frame_times.append(t)
-            self._taken += 1
+            self._frames_taken += 1
             self.stats.frames += 1
 
     def _change_tool_when_due(self) -> None:
         while self._planned and self._planned[0].at_s <= self.now():
-            self._wanted_tool = np.array(self._planned.popleft().marker_xyz)
-        if self._wanted_tool is None:
+            self._requested_tool = np.array(self._planned.popleft().marker_xyz)
+        if self._requested_tool is None:
             return
-        self._physics.change_tool(self._wanted_tool)
-        self._wanted_tool = None
+        self._physics.change_tool(self._requested_tool)
+        self._requested_tool = None
         self.stats.tool_changes += 1
 
 

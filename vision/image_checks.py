@@ -12,7 +12,7 @@ from bodyschema.interfaces.records import ImageArray, StereoFrame
 
 
 class ImageSettings:
-    white, most_white = 250, 0.4  # grey level of an over-exposed pixel, and the largest share of them in a usable image
+    white, max_white = 250, 0.4  # grey level of an over-exposed pixel, and the largest share of them in a usable image
     black = 20  # grey level that hardly a pixel of a black image exceeds
 
 
@@ -62,4 +62,4 @@ def is_black(image: ImageArray) -> bool:
 def too_white(levels: ImageArray) -> float | None:
     """Return the share of white among grey levels, if it is too large."""
     white = float(np.mean(levels >= ImageSettings.white))
-    return white if white > ImageSettings.most_white else None
+    return white if white > ImageSettings.max_white else None

@@ -11,7 +11,7 @@ from bodyschema.interfaces.records import ImageArray
 from bodyschema.robot.limited import read_at_most
 
 # The largest camera images, uncompressed, have half of it.
-MOST_BYTES = 2**28
+MAX_BYTES = 2**28
 
 
 def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
@@ -21,7 +21,7 @@ def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
         flags: flags of `cv2.imdecode`; by default those of a colour image.
     """
     try:
-        data = np.frombuffer(read_at_most(file, MOST_BYTES), np.uint8)
+        data = np.frombuffer(read_at_most(file, MAX_BYTES), np.uint8)
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):  # raised by OpenCV for more pixels than it allows
         return None

@@ -61,7 +61,7 @@ class PoseEstimator:
 
     def __init__(self, calibration: StereoCalibration, sightings: Sequence[Sighting]) -> None:
         self._calibration = calibration
-        self._eyes = [_all_of(sightings, right) for right in (False, True) if any(s.right == right for s in sightings)]
+        self._eyes = [_merged(sightings, right) for right in (False, True) if any(s.right == right for s in sightings)]
         self._roots = [whitening(eye.cov_px, calibration.pixel_sigma) for eye in self._eyes]
         whitened = [root @ eye.shared_px.ravel() for eye, root in zip(self._eyes, self._roots, strict=True)]
         self._shared = np.concatenate(whitened)
@@ -85,18 +85,18 @@ class PoseEstimator:
         turn = np.asarray(cv2.Rodrigues(change[:3])[0], np.float64)
         return self._linearised(turn @ now.rotation, now.x + change[3:])
 
-    def scale(self, pose: Pose) -> tuple[float, float]:
+    def size_error(self, pose: Pose) -> tuple[float, float]:
         """Return the relative size error of the body against its nominal size, and its 1-sigma.
 
         One more Gauss-Newton step with the size free: the eyes' distance against the printed size.
         """
-        there = self._linearised(pose.rotation, pose.x)
-        if there is None:
+        linear = self._linearised(pose.rotation, pose.x)
+        if linear is None:
             return math.inf, 0.0
-        grown = self._whitened([self._moved(eye, pose).ravel() for eye in self._eyes])
-        full = np.column_stack([there.jacobian, grown])
+        by_size = self._whitened([self._by_size(eye, pose).ravel() for eye in self._eyes])
+        full = np.column_stack([linear.jacobian, by_size])
         cov = np.linalg.inv(full.T @ full)
-        return float((cov @ full.T @ there.residuals)[6]), math.sqrt(cov[6, 6])
+        return float((cov @ full.T @ linear.residuals)[6]), math.sqrt(cov[6, 6])
 
     def bent(self, pose: Pose, heights: FloatArray) -> Pose:
         """Return the pose of a plate that may be bent, with a covariance that includes its confusion with a bend.
@@ -107,31 +107,31 @@ class PoseEstimator:
             pose: pose of a flat plate.
             heights: each bend's heights (k, m) [m] at the points, all of which every eye sees.
         """
-        there = self._linearised(pose.rotation, pose.x)
-        if there is None:
+        linear = self._linearised(pose.rotation, pose.x)
+        if linear is None:
             return pose
-        bends = [self._raised(eye, pose)[..., None] * heights[:, None] for eye in self._eyes]
-        raised = self._whitened([each.reshape(-1, heights.shape[1]) for each in bends])
-        full = np.column_stack([there.jacobian, raised])
+        bends = [self._by_height(eye, pose)[..., None] * heights[:, None] for eye in self._eyes]
+        by_bending = self._whitened([each.reshape(-1, heights.shape[1]) for each in bends])
+        full = np.column_stack([linear.jacobian, by_bending])
         cov = np.linalg.inv(full.T @ full)
-        amounts = (cov @ full.T @ there.residuals)[6:]
+        amounts = (cov @ full.T @ linear.residuals)[6:]
         full[:, 6:] *= np.sqrt(amounts**2 + np.diag(cov)[6:])
         cov = np.asarray(np.linalg.inv(full.T @ full + np.diag([0.0] * 6 + [1.0] * len(amounts))), np.float64)
-        change = cov @ full.T @ there.residuals
-        left = there.residuals - full @ change
+        change = cov @ full.T @ linear.residuals
+        remaining = linear.residuals - full @ change
         turn = np.asarray(cv2.Rodrigues(change[:3])[0], np.float64)
-        squares = float(left @ left + change[6:] @ change[6:])
+        squares = float(remaining @ remaining + change[6:] @ change[6:])
         return Pose(turn @ pose.rotation, pose.x + change[3:6], cov[:6, :6], squares)
 
-    def _raised(self, eye: Sighting, pose: Pose) -> FloatArray:
+    def _by_height(self, eye: Sighting, pose: Pose) -> FloatArray:
         """Return the derivative of an eye's pixels by the height of its points along the body's z (k, 2)."""
         points = eye.points @ pose.rotation.T + self._in_eye(pose.x, eye)
-        return projection_slopes(self._calibration.focal_px, points) @ pose.rotation[:, 2]
+        return projection_jacobian(self._calibration.focal_px, points) @ pose.rotation[:, 2]
 
-    def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
+    def _by_size(self, eye: Sighting, pose: Pose) -> FloatArray:
         """Return the derivative of an eye's pixels by the body's size (k, 2)."""
         arms = eye.points @ pose.rotation.T
-        return (projection_slopes(self._calibration.focal_px, arms + self._in_eye(pose.x, eye)) @ arms[..., None])[
+        return (projection_jacobian(self._calibration.focal_px, arms + self._in_eye(pose.x, eye)) @ arms[..., None])[
             ..., 0
         ]
 
@@ -145,8 +145,8 @@ class PoseEstimator:
             points = arms + self._in_eye(x, eye)
             if (points[:, 2] <= 0.0).any():
                 return None
-            projection = projection_slopes(self._calibration.focal_px, points)
-            by_turn = projection @ turned(arms)
+            projection = projection_jacobian(self._calibration.focal_px, points)
+            by_turn = projection @ turn_jacobian(arms)
             seen = self._calibration.focal_px * points[:, :2] / points[:, 2:] + self._calibration.principal_point_px
             residuals.append((eye.pixels - seen).ravel())
             jacobians.append(np.concatenate([by_turn, projection], axis=2).reshape(-1, 6))
@@ -158,7 +158,7 @@ class PoseEstimator:
         return values - np.multiply.outer(self._shrink * self._shared, self._shared @ values)
 
 
-def _all_of(sightings: Sequence[Sighting], right: bool) -> Sighting:
+def _merged(sightings: Sequence[Sighting], right: bool) -> Sighting:
     """Return one eye's sighting of all points."""
     seen = [sighting for sighting in sightings if sighting.right == right]
     points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
@@ -166,7 +166,7 @@ def _all_of(sightings: Sequence[Sighting], right: bool) -> Sighting:
     return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right, shared)
 
 
-def projection_slopes(focal_px: float, points: FloatArray) -> FloatArray:
+def projection_jacobian(focal_px: float, points: FloatArray) -> FloatArray:
     """Return the derivative (k, 2, 3) [px/m] of the pixels of points (k, 3) in an eye's frame."""
     rows = np.zeros((len(points), 2, 3))
     scale = focal_px / points[:, 2]
@@ -187,7 +187,7 @@ def whitening(cov_px: FloatArray, pixel_sigma: float) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), dtype=np.float64)
 
 
-def turned(arms: FloatArray) -> FloatArray:
+def turn_jacobian(arms: FloatArray) -> FloatArray:
     """Return matrices (k, 3, 3) with ω × arm = −[arm]× ω for arms (k, 3) under a small rotation ω."""
     matrices = np.zeros((len(arms), 3, 3))
     x, y, z = arms.T
@@ -224,7 +224,7 @@ def fitted_motion(body: FloatArray, seen: FloatArray) -> tuple[FloatArray, Float
     return rotation, middle_seen - rotation @ middle_body
 
 
-def first_pose(
+def initial_poses(
     calibration: StereoCalibration, points: FloatArray, pixels: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return the poses, as rotation (3, 3) and origin (3,) [m], with which `points` project near `pixels`.

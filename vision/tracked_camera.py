@@ -28,10 +28,10 @@ class MarkerTracker(Protocol):
         """Forget all earlier frames."""
 
 
-class Draws(Protocol):
+class FrameAnnotator(Protocol):
     """Interface of an annotator, which draws a tracker's result into its frame."""
 
-    def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
+    def annotated(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
         """Return all images side by side, with annotations."""
         ...
 
@@ -43,7 +43,7 @@ class TrackedCamera:
         self,
         camera: StereoCamera,
         tracker: MarkerTracker,
-        annotator: Draws | None = None,
+        annotator: FrameAnnotator | None = None,
         readout_s: float = 0.0,
         readout_sigma_s: float = 0.0,
     ) -> None:
@@ -67,7 +67,7 @@ class TrackedCamera:
         newest = self._newest
         if newest is None or self._annotator is None:
             return None
-        return jpeg(shrunk(self._annotator.drawn(*newest), widest_px=1280))  # beside other panels of a page
+        return jpeg(shrunk(self._annotator.annotated(*newest), widest_px=1280))  # beside other panels of a page
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
         """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s` [s].

@@ -23,7 +23,7 @@ class Location:
     variances_px: FloatArray  # variances of `centres_px`, shape (4,) [px²]
     level: float  # brightness of the marker's colour on it, mean of the eyes [grey levels]
     # deviation of the limbs from their ellipses, geometric mean of the two discs', in variances of their samples
-    unrest: float
+    roughness: float
     radii_px: FloatArray  # of the two discs, shape (2,) [px]
     # sizes, size_sigmas: the radii relative to those expected at this depth, and the 1-sigma of that due to the images,
     # shape (2,) each
@@ -88,7 +88,7 @@ def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: D
         centres_px=centres,
         variances_px=variances,
         level=(left.level + right.level) / 2,
-        unrest=math.sqrt(left.unrest * right.unrest),
+        roughness=math.sqrt(left.roughness * right.roughness),
         radii_px=radii_px,
         sizes=radii_px / expected_px,
         size_sigmas=np.array([left.radius_sigma_px, right.radius_sigma_px]) / radii_px,

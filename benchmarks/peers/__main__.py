@@ -54,7 +54,7 @@ def main() -> None:
         deadline,
         arguments.fit_limit_s,
         arguments.most_pairs,
-        arguments.fewest_pairs,
+        arguments.min_pairs,
     )
     saved = begin
 
@@ -75,7 +75,7 @@ def main() -> None:
             "when": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
             "seconds": round(time.monotonic() - begin),
             "arguments": f"{arguments.seeds} seeds, {len(chosen)} tasks, "
-            f"{arguments.fewest_pairs} to {arguments.most_pairs} pairs",
+            f"{arguments.min_pairs} to {arguments.most_pairs} pairs",
         }
     )
     results.save(arguments.json)

@@ -40,7 +40,7 @@ class Plan:
     deadline_s: float
     fit_limit_s: float
     most_pairs: int
-    fewest_pairs: int = 0
+    min_pairs: int = 0
     clock: Callable[[], float] = time.monotonic
 
 
@@ -53,7 +53,7 @@ class Job:
 
 def jobs(plan: Plan) -> Iterator[Job]:
     """Yield every task at few pairs first, then the next seed; expensive sizes follow the cheap ones."""
-    counts = sorted({n for task in plan.tasks for n in task.counts if plan.fewest_pairs <= n <= plan.most_pairs})
+    counts = sorted({n for task in plan.tasks for n in task.counts if plan.min_pairs <= n <= plan.most_pairs})
     for cheap in (True, False):
         for seed in range(plan.seeds):
             for pairs in counts:

@@ -23,7 +23,7 @@ from .markers import several_markers
 from .reading import Reading
 from .rows import all_shifted, few_outliers, many_apart, partly_carried, partly_shifted
 from .search import ReadingFit, ReadingSearch, SearchSettings, nameable
-from .size import of_another_size, size_of
+from .size import size_of, wrong_size
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 
@@ -38,7 +38,7 @@ class _Settings:
     exact: float = 1e-5  # distances below this share of the reach are not distinguished
 
 
-def told_sigma(recording: Recording) -> float | None:
+def recorded_sigma(recording: Recording) -> float | None:
     """Return the 1-sigma of a coordinate [m], if the recording has it."""
     if recording.cov is None:
         return None
@@ -75,14 +75,14 @@ def plausibility(
     if found.refusal is None:
         columns = check.columns(None if orientation is None else orientation[rows])
         found = replace(columns, warnings=(*found.warnings, *columns.warnings))
-    return _decided(found, search, len(q))
+    return _softened(found, search, len(q))
 
 
 @dataclass(frozen=True, slots=True)
 class _Check:
     robot: RobotDescription  # the robot's description
     search: ReadingSearch  # the finished search over readings of the columns
-    as_it_is: Reading  # the unchanged columns
+    unchanged: Reading  # the unchanged columns
     best: Reading  # the simplest among the best readings
     others: list[Reading]  # others nearly as simple
     spread: float  # of the positions [m]
@@ -91,22 +91,22 @@ class _Check:
     def rows_and_size(self, q: FloatArray, x: FloatArray, t: FloatArray | None) -> Plausibility:
         """Return the faults of the rows or the size of all pairs q (n, d) [rad, m], x (n, 3) [m] and t (n,)."""
         search, best = self.search, self.search.fits[self.best].error
-        placed = self._is_nameable(self.as_it_is) or self._is_nameable(self.best)
+        placed = self._is_nameable(self.unchanged) or self._is_nameable(self.best)
         if not placed or many_apart(search, THRESHOLDS.named * self.spread):
             shifted = all_shifted(search, q, x, t)
             if shifted is not None:
                 return shifted
         if not (self._fits_clearly_better and self._is_nameable(self.best)):
-            fits = self._before < THRESHOLDS.named * self.spread
-            wrong = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
+            fits = self._error_unchanged < THRESHOLDS.named * self.spread
+            refusal_found = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
                 search, q, x, t, fits=fits
             )
-            if wrong is None and self._before > _Settings.of_one_marker * self.spread:
-                wrong = several_markers(search, self._before)
-            if wrong is not None:
-                return wrong
+            if refusal_found is None and self._error_unchanged > _Settings.of_one_marker * self.spread:
+                refusal_found = several_markers(search, self._error_unchanged)
+            if refusal_found is not None:
+                return refusal_found
         size = size_of(search.chain, search.q, search.x, search.poses.rows, search.exact_m)
-        return of_another_size(size, spread_m(search.x), self._before, best) or Plausibility()
+        return wrong_size(size, spread_m(search.x), self._error_unchanged, best) or Plausibility()
 
     def columns(self, orientation: FloatArray | None) -> Plausibility:
         """Return the faults of the columns.
@@ -116,91 +116,91 @@ class _Check:
         """
         search, reading = self.search, self.best
         if not (self._fits_clearly_better or self._is_nameable(reading)):
-            reading = self.as_it_is
+            reading = self.unchanged
         fit = search.fits[reading]
         after = fit.error / reading.scale
-        held = search.with_marker_known(reading) if self.robot.robot.marker_known else None
-        if held is not None and reading != self.as_it_is:
-            reading, fit = held
-        of_another_arm = max(
+        turned = search.with_marker_known(reading) if self.robot.robot.marker_known else None
+        if turned is not None and reading != self.unchanged:
+            reading, fit = turned
+        other_arm_limit = max(
             _Settings.unexplained * self.spread / reading.scale, _Settings.of_reach * reach_m(self.robot), self.noise
         )
-        unnamed = reading != self.as_it_is and not nameable(reading, fit, self.spread)
-        if after > of_another_arm or (unnamed and after > self.noise):
-            outliers = few_outliers(search, self._before)
-            return Plausibility(warnings=(outliers,)) if outliers else self._of_no_reading(reading, fit, after)
-        if reading != self.as_it_is:
-            return self._of_another_reading(reading, fit, after)
-        found = self._as_it_is(fit, held)
+        not_nameable = reading != self.unchanged and not nameable(reading, fit, self.spread)
+        if after > other_arm_limit or (not_nameable and after > self.noise):
+            outliers = few_outliers(search, self._error_unchanged)
+            return Plausibility(warnings=(outliers,)) if outliers else self._report_no_reading(reading, fit, after)
+        if reading != self.unchanged:
+            return self._report_other_reading(reading, fit, after)
+        found = self._report_unchanged(fit, turned)
         if orientation is None or found.refusal is not None:
             return found
         return reordered_quaternions(search.chain, search.q + fit.zeros, orientation, fit) or found
 
     @property
-    def _before(self) -> float:
+    def _error_unchanged(self) -> float:
         """Distance of the pairs with unchanged columns [m]."""
-        return self.search.fits[self.as_it_is].error
+        return self.search.fits[self.unchanged].error
 
     @property
     def _fits_clearly_better(self) -> bool:
-        return self._before > THRESHOLDS.much_better * self.search.fits[self.best].error
+        return self._error_unchanged > THRESHOLDS.much_better * self.search.fits[self.best].error
 
     def _is_nameable(self, reading: Reading) -> bool:
         return nameable(reading, self.search.fits[reading], self.spread)
 
-    def _of_no_reading(self, nearest: Reading, fit: ReadingFit, after: float) -> Plausibility:
-        doubted = ""
-        if nearest != self.as_it_is:
-            looks = nearest.looks(self.robot.joints, fit.zeros)
-            doubted = f". The nearest reading is that {looks}, and it does not fit"
+    def _report_no_reading(self, nearest: Reading, fit: ReadingFit, after: float) -> Plausibility:
+        nearest_text = ""
+        if nearest != self.unchanged:
+            label = nearest.label(self.robot.joints, fit.zeros)
+            nearest_text = f". The nearest reading is that {label}, and it does not fit"
         return Plausibility(
             f"the pairs are hardly of this robot: {self._nominal_arm_misses()}, and with joints exchanged, counting "
             f"the other way or a quarter turn off still by {mm(after)}",
             "Is the recording or the URDF of another robot, is the camera on the hand and the marker in the room, are "
             "the time stamps late (`bodyschema diagnose --force` measures it), or is more than one thing wrong with "
-            f"the columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
-            better=self._before / (THRESHOLDS.right * self.spread),
+            f"the columns? Where the positions are that noisy, say so with --sigma-mm{nearest_text}",
+            better=self._error_unchanged / (THRESHOLDS.right * self.spread),
         )
 
-    def _of_another_reading(self, reading: Reading, fit: ReadingFit, after: float) -> Plausibility:
+    def _report_other_reading(self, reading: Reading, fit: ReadingFit, after: float) -> Plausibility:
         """Report another reading that fits better than the unchanged columns."""
         names = self.robot.joints
         mirrored = self.robot.camera.pose_known and reading.mirrored
         frame = order_of_axes(fit.rotation, mirrored=True) if mirrored else ""
-        fits = f"the pairs then fit to {mm(after)}, and as they are to {mm(self._before)}"
-        text = f"{reading.looks(names, fit.zeros)}{frame}: {fits}"
-        if after > self._before:
+        fits = f"the pairs then fit to {mm(after)}, and as they are to {mm(self._error_unchanged)}"
+        text = f"{reading.label(names, fit.zeros)}{frame}: {fits}"
+        if after > self._error_unchanged:
             text = (
                 f"{text}, but with links that are off by as much as those of arms this is more probable. Check it on "
                 "the arm before you use the model"
             )
-        either = "; or ".join(other.looks(names, self.search.fits[other].zeros) for other in self.others)
-        either = f". These pairs fit as well if {either}" if either else ""
-        if self._before > THRESHOLDS.much_better * fit.error:
-            better = self._before / max(fit.error, self.search.exact_m)
-            remedy = reading.remedy(names, fit.zeros) + either
+        alternatives = "; or ".join(other.label(names, self.search.fits[other].zeros) for other in self.others)
+        alternatives = f". These pairs fit as well if {alternatives}" if alternatives else ""
+        if self._error_unchanged > THRESHOLDS.much_better * fit.error:
+            better = self._error_unchanged / max(fit.error, self.search.exact_m)
+            remedy = reading.remedy(names, fit.zeros) + alternatives
             return Plausibility(f"it seems that {text}", remedy, misread=True, better=better)
-        return Plausibility(warnings=(f"perhaps {text}{either}",))
+        return Plausibility(warnings=(f"perhaps {text}{alternatives}",))
 
-    def _as_it_is(self, fit: ReadingFit, held: tuple[Reading, ReadingFit] | None) -> Plausibility:
+    def _report_unchanged(self, fit: ReadingFit, by_marker: tuple[Reading, ReadingFit] | None) -> Plausibility:
         """Report on columns that are right, except for the last joint's offset and the measurement frame."""
         search, names = self.search, self.robot.joints
         turned = None
         if self.robot.camera.pose_known:
             turned = turned_frame(search.chain, search.q, search.x, fit)
-        if held is not None and turned is None:
-            reading, then = held
+        if by_marker is not None and turned is None:
+            reading, new_fit = by_marker
             return Plausibility(
-                f"it seems that {reading.looks(names, then.zeros)}: {_marker_then(then.tool_m, fit.tool_m)}",
-                f"{reading.remedy(names, then.zeros)}. Or correct marker_xyz, or set marker_known = false",
+                f"it seems that {reading.label(names, new_fit.zeros)}: {_marker_text(new_fit.tool_m, fit.tool_m)}",
+                f"{reading.remedy(names, new_fit.zeros)}. Or correct marker_xyz, or set marker_known = false",
                 misread=True,
             )
         found = turned or self._warnings(fit)
-        nearer = None if self.robot.robot.marker_known else search.with_marker_nearer(self.as_it_is)
+        nearer = None if self.robot.robot.marker_known else search.with_marker_nearer(self.unchanged)
         if nearer is None:
             return found
-        looks = nearer.looks(names, fit.zeros)
-        perhaps = f"perhaps {looks}: {_marker_then(search.fits[nearer].tool_m, fit.tool_m)}"
+        label = nearer.label(names, fit.zeros)
+        perhaps = f"perhaps {label}: {_marker_text(search.fits[nearer].tool_m, fit.tool_m)}"
         return replace(found, warnings=(*found.warnings, perhaps))
 
     def _warnings(self, fit: ReadingFit) -> Plausibility:
@@ -213,14 +213,14 @@ class _Check:
         ]
         if fit.error > max(THRESHOLDS.named * self.spread, self.noise):
             other = f"{self._nominal_arm_misses()}: they may be of another robot, or their columns misread"
-            warnings.append(few_outliers(self.search, self._before) or other)
+            warnings.append(few_outliers(self.search, self._error_unchanged) or other)
         return Plausibility(warnings=tuple(warnings), undirected=self.search.undirected(names))
 
     def _nominal_arm_misses(self) -> str:
-        return f"placed as well as it can be, the nominal arm misses the pairs by {mm(self._before)}"
+        return f"placed as well as it can be, the nominal arm misses the pairs by {mm(self._error_unchanged)}"
 
 
-def _decided(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibility:
+def _softened(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibility:
     """Turn a refusal into a warning if there are too few pairs or poses for it."""
     enough = pairs >= FEWEST_ROWS and (found.better == 1.0 or search.is_certain(math.log(found.better)))
     if found.refusal is None or enough or found.better >= THRESHOLDS.decisively:
@@ -230,7 +230,7 @@ def _decided(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibi
     return Plausibility(warnings=(few,))
 
 
-def _marker_then(then_m: float, now_m: float) -> str:
+def _marker_text(then_m: float, now_m: float) -> str:
     return (
         f"the marker then comes out {mm(then_m)} from its place in [robot] of robot.toml, and as the columns are "
         f"{mm(now_m)} from it"
@@ -238,12 +238,16 @@ def _marker_then(then_m: float, now_m: float) -> str:
 
 
 # Orders of a quaternion in the columns qx, qy, qz, qw.
-_AS_IT_IS = ""
-_W_FIRST = "hold a quaternion with w first"
+_UNCHANGED = ""
+_SCALAR_FIRST = "hold a quaternion with w first"
 _CONJUGATE = "hold the conjugate of the marker's orientation, that of the measurement frame in the marker"
 _REORDER = "name the columns qw, qx, qy, qz"
 _NEGATE = "multiply qx, qy and qz by -1"
-_REMEDIES = {_W_FIRST: _REORDER, _CONJUGATE: _NEGATE, f"{_W_FIRST}, and {_CONJUGATE}": f"{_REORDER}, and {_NEGATE}"}
+_REMEDIES = {
+    _SCALAR_FIRST: _REORDER,
+    _CONJUGATE: _NEGATE,
+    f"{_SCALAR_FIRST}, and {_CONJUGATE}": f"{_REORDER}, and {_NEGATE}",
+}
 
 
 def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFit) -> Plausibility | None:
@@ -251,13 +255,13 @@ def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFi
     angle = float(np.linalg.norm(rotation_vector(fit.rotation)))
     if angle < THRESHOLDS.turned_rad:
         return None
-    told, free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
-    if told < THRESHOLDS.much_better * free:
+    rms_known, rms_free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
+    if rms_known < THRESHOLDS.much_better * rms_free:
         return None
     return Plausibility(
         f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
-        f"{order_of_axes(fit.rotation, mirrored=False)}: the pairs then fit to {mm(free)}, and as they are to "
-        f"{mm(told)}",
+        f"{order_of_axes(fit.rotation, mirrored=False)}: the pairs then fit to {mm(rms_free)}, and as they are to "
+        f"{mm(rms_known)}",
         "Correct the columns x, y, z, the pose of the camera or the zero of the first joint; or set pose_known = false",
         misread=True,
     )
@@ -265,12 +269,12 @@ def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFi
 
 def order_of_axes(rotation: FloatArray, *, mirrored: bool) -> str:
     """Return the order and signs in which x, y, z are given, if they are axes of robot.toml's frame, otherwise ""."""
-    given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
-    which = np.abs(given).argmax(axis=1)
-    along = np.abs(given).max(axis=1)
-    if len(set(which.tolist())) < 3 or along.min() < math.cos(THRESHOLDS.turned_rad):
+    axes = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
+    indices = np.abs(axes).argmax(axis=1)
+    lengths = np.abs(axes).max(axis=1)
+    if len(set(indices.tolist())) < 3 or lengths.min() < math.cos(THRESHOLDS.turned_rad):
         return ""
-    order = ", ".join(f"{'-' if given[k, axis] < 0.0 else ''}{'xyz'[axis]}" for k, axis in enumerate(which))
+    order = ", ".join(f"{'-' if axes[k, axis] < 0.0 else ''}{'xyz'[axis]}" for k, axis in enumerate(indices))
     return f" (the columns x, y, z hold {order})"
 
 
@@ -279,10 +283,10 @@ def reordered_quaternions(
 ) -> Plausibility | None:
     """Return a refusal if the quaternions fit far better in another order, or inverted, otherwise None."""
     plain, first, conjugate = orientation, np.roll(orientation, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
-    readings = zip((_AS_IT_IS, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
+    readings = zip((_UNCHANGED, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
     hand = fit.rotation @ chain.orientation(q)
     errors = {name: _scatter(hand.swapaxes(1, 2) @ rotation_matrices("orientation", read)) for name, read in readings}
-    before, best = errors.pop(_AS_IT_IS), min(errors, key=errors.__getitem__)
+    before, best = errors.pop(_UNCHANGED), min(errors, key=errors.__getitem__)
     after = errors[best]
     better = before / max(after, THRESHOLDS.oriented_rad)
     if better <= THRESHOLDS.much_better:

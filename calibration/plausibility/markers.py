@@ -38,21 +38,21 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
     if rows < 2 * _Settings.chosen:
         return None
     chosen = rng.permuted(np.tile(np.arange(rows), (_Settings.tries, 1)), axis=1)[:, : _Settings.chosen]
-    found = search.placed_by(chosen)
-    scatters = [_scatter(search.on_hand(found, k)) for k in range(_Settings.tries)]
-    places = _places(search, search.on_hand(found, int(np.argmin(scatters))))
+    found = search.place_rows(chosen)
+    scatters = [_scatter(search.offsets_on_hand(found, k)) for k in range(_Settings.tries)]
+    places = _places(search, search.offsets_on_hand(found, int(np.argmin(scatters))))
     counts = np.bincount(places[places >= 0], minlength=1)
     largest = np.flatnonzero(places == counts.argmax())
     if len(largest) < _Settings.chosen:
         return None
-    on_hand = search.on_hand(search.placed_by(largest[None]), 0)
-    places = _places(search, on_hand)
+    offsets_on_hand = search.offsets_on_hand(search.place_rows(largest[None]), 0)
+    places = _places(search, offsets_on_hand)
     names = np.unique(places[places >= 0])
     if len(names) < 2 or (places >= 0).mean() < _Settings.covered:
         return None
-    centres = np.stack([on_hand[places == name].mean(axis=0) for name in names])
+    centres = np.stack([offsets_on_hand[places == name].mean(axis=0) for name in names])
     kept = places >= 0
-    off = on_hand[kept] - centres[np.searchsorted(names, places[kept])]
+    off = offsets_on_hand[kept] - centres[np.searchsorted(names, places[kept])]
     after = max(float(np.sqrt(np.square(off).sum(axis=1).mean())), search.exact_m)
     # A marker that was moved once is reported by calibration, with its row.
     changes = int((np.diff(places[kept]) != 0).sum())
@@ -70,15 +70,15 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
     )
 
 
-def _scatter(on_hand: FloatArray) -> float:
+def _scatter(offsets_on_hand: FloatArray) -> float:
     """Return the median distance of points (n, 3) from the nearest but one [m]."""
-    apart = np.linalg.norm(on_hand[:, None] - on_hand, axis=2)
+    apart = np.linalg.norm(offsets_on_hand[:, None] - offsets_on_hand, axis=2)
     return float(np.median(np.partition(apart, 2, axis=1)[:, 2]))
 
 
-def _places(search: ReadingSearch, on_hand: FloatArray) -> NDArray[np.intp]:
+def _places(search: ReadingSearch, offsets_on_hand: FloatArray) -> NDArray[np.intp]:
     """Return the place of each point (n,), from 1; -1 for a point without enough others at its place."""
-    places = np.asarray(fcluster(linkage(on_hand), _Settings.one_place_m, "distance"), dtype=np.intp)
+    places = np.asarray(fcluster(linkage(offsets_on_hand), _Settings.one_place_m, "distance"), dtype=np.intp)
     for place in range(1, int(places.max()) + 1):
         rows = np.flatnonzero(places == place)
         # Repeated or held poses have the same errors of the arm in each row.

@@ -124,17 +124,17 @@ class Reading:
             + sum((self.mirrored, self.unit != METRES, self.degrees, self.millimetres))
         )
 
-    def looks(self, joints: Sequence[str], zeros: FloatArray) -> str:
+    def label(self, joints: Sequence[str], zeros: FloatArray) -> str:
         """Return the changes in words, as in `the columns q1 and q2 are exchanged`.
 
         Args:
             zeros: joint offsets (d,) besides the quarter turns [rad, m].
         """
-        return _listed([looks for looks, _ in self._said(joints, zeros)])
+        return _listed([label for label, _ in self._describe_changes(joints, zeros)])
 
     def remedy(self, joints: Sequence[str], zeros: FloatArray) -> str:
-        """Return the remedy; arguments as in `looks`."""
-        remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
+        """Return the remedy; arguments as in `label`."""
+        remedies = "; ".join(remedy for _, remedy in self._describe_changes(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
 
     def _with_sign(self, k: int) -> Reading:
@@ -155,7 +155,7 @@ class Reading:
             signs=_replaced(self.signs, {j: self.signs[k], k: self.signs[j]}),
         )
 
-    def _said(self, joints: Sequence[str], zeros: FloatArray) -> Iterator[tuple[str, str]]:
+    def _describe_changes(self, joints: Sequence[str], zeros: FloatArray) -> Iterator[tuple[str, str]]:
         moved = [k for k, column in enumerate(self.order) if column != k]
         names = _listed([joints[k] for k in moved]) if moved else ""
         if len(moved) == 2:

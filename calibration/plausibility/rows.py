@@ -40,7 +40,7 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
             break
         left_out = np.array(list(itertools.combinations(range(rows), off)))
         kept = np.array([np.delete(np.arange(rows), some) for some in left_out])
-        errors = search.placed_by(kept).errors(1.0)
+        errors = search.place_rows(kept).errors(1.0)
         best = int(errors.argmin())
         if errors[best] < THRESHOLDS.named / (1 + off) * spread_m(search.x):
             *first, last = (str(row + 1) for row in left_out[best].tolist())
@@ -102,8 +102,8 @@ def partly_shifted(
     own_q, own_x = q[rows], x[rows]
     of_angles = [(q[rows + shift], own_x) for shift in shifts]
     pairs = [(own_q, own_x), *of_angles, *((own_q, x[rows + shift]) for shift in shifts)]
-    placed_by = [(own_q, own_x), *([] if fits else of_angles)]
-    found = np.stack([search.distances(*placed, pairs) for placed in placed_by])
+    place_rows = [(own_q, own_x), *([] if fits else of_angles)]
+    found = np.stack([search.distances(*placed, pairs) for placed in place_rows])
     nearer = _Settings.shifted_better * found.min(axis=0)[1:] < found[0, 0]
     shares = nearer.mean(axis=1).reshape(2, -1)
     angles, positions = shares.max(axis=1)
@@ -143,7 +143,7 @@ def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility 
         return None
     nothing = np.zeros(len(names))
     return Plausibility(
-        f"it seems that {readings[best].looks(names, nothing)}: {100.0 * float(nearer[best].mean()):.0f} % of the rows "
+        f"it seems that {readings[best].label(names, nothing)}: {100.0 * float(nearer[best].mean()):.0f} % of the rows "
         f"then fit at least {_Settings.shifted_better:g} times better",
         readings[best].remedy(names, nothing),
         misread=True,

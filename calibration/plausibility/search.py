@@ -17,7 +17,7 @@ from kbmaps.rotations import rotation_vectors
 
 from .limits import LimitSettings, spread_m
 from .reading import QUARTER, Reading
-from .size import evidences
+from .size import log_evidences
 from .verdict import THRESHOLDS
 
 
@@ -43,7 +43,7 @@ class Poses:
         """Return the mean of values (n,) of the rows, each pose counted once."""
         return float((np.bincount(self.of_rows, values) / np.bincount(self.of_rows)).mean())
 
-    def nats(self, gain: float, joints: int, share: float = 1.0) -> float:
+    def evidence_gain(self, gain: float, joints: int, share: float = 1.0) -> float:
         """Return the evidence for a reading over another one, each placed by these rows [nats].
 
         Any reading fits as many coordinates as there are offsets of joints, camera and marker.
@@ -60,14 +60,14 @@ class SearchSettings:
     width: int = 4
     depth: int = 5
     # Readings whose errors differ by less count as one: offsets of the first and of the last joint make no difference.
-    same: float = 0.005
+    same_error: float = 0.005
     # The search ends at a fit with these shares of the positions' spread: of the columns as they are, and read
     # otherwise.
-    enough_as_it_is: float = 0.03
+    enough_unchanged: float = 0.03
     enough: float = 0.01
     # A reading is more probable by this much [nats], less a penalty for each change of the reading.
-    certain: float = 10.0
-    a_change: float = 3.0
+    min_evidence: float = 10.0
+    change_penalty: float = 3.0
     # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
     far_zero_rad: float = math.radians(20.0)
     near_zero_rad: float = far_zero_rad / 2.0  # ... unless the pairs fit about as well with half of it.
@@ -93,7 +93,7 @@ class ReadingFit:
     """Quality of a reading's fit."""
 
     error: float  # RMS distance of the nearest pairs, in the recording's own unit
-    nats: float  # minus the log-likelihood, including the cost of offsets and marker
+    neg_log_posterior: float  # minus the log-likelihood, including the cost of offsets and marker
     zeros: FloatArray  # added to the joints (d,) beside the quarter turns [rad, m]
     tool_m: float  # distance of the marker from its place [m]
     rotation: FloatArray  # of the nominal measurement frame in the real one (3, 3)
@@ -118,48 +118,52 @@ class ReadingSearch:
 
     def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
         """Return the unchanged columns, the simplest reading among the best, and others nearly as simple."""
-        as_it_is = Reading.plain(self.chain.joints)
+        unchanged = Reading.plain(self.chain.joints)
         slides: list[bool] = self.chain.prismatic.tolist()
-        self._try([as_it_is, *as_it_is.neighbours(slides), *self.carrying()])
-        if self._best()[0] != as_it_is:
+        self._try([unchanged, *unchanged.neighbours(slides), *self.carrying()])
+        if self._best()[0] != unchanged:
             # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
-            self._fit([as_it_is] * 6, tools=LimitSettings.tool_m * np.concatenate([np.eye(3), -np.eye(3)]))
-        expanded, spread = [as_it_is], spread_m(self.x)
+            self._fit([unchanged] * 6, tools=LimitSettings.tool_m * np.concatenate([np.eye(3), -np.eye(3)]))
+        expanded, spread = [unchanged], spread_m(self.x)
         for depth in range(1, SearchSettings.depth):
             best = self._best()[0]
             left = self.fits[best].error / spread
             if best in expanded and (
                 left < SearchSettings.enough
-                or (best == as_it_is and (left < SearchSettings.enough_as_it_is or depth > 1))
+                or (best == unchanged and (left < SearchSettings.enough_unchanged or depth > 1))
             ):
                 break
             new = self._distinct(expanded)
             expanded += new
             if depth == 1:
-                self._try(as_it_is.doubles(slides))
+                self._try(unchanged.doubles(slides))
             self._try(other for reading in new for other in reading.neighbours(slides))
         best = self._best()[0]
-        enough = SearchSettings.enough_as_it_is if best == as_it_is else SearchSettings.enough
+        enough = SearchSettings.enough_unchanged if best == unchanged else SearchSettings.enough
         if self.fits[best].error > enough * spread:
-            self._try(as_it_is.mixed(slides))
+            self._try(unchanged.mixed(slides))
         best = self._best()[0]
         if not nameable(best, self.fits[best], spread):
-            self._fit([as_it_is], tools=self._aligned_tool())
-            self._try(as_it_is.mixed_exchanges(slides))
+            self._fit([unchanged], tools=self._aligned_tool())
+            self._try(unchanged.mixed_exchanges(slides))
             self._try(other for reading in self._distinct(expanded) for other in reading.neighbours(slides))
-        if as_it_is not in self.fits:
-            self._fit([as_it_is], held=True)
-        best, refuted = self._most_probable(as_it_is)
+        if unchanged not in self.fits:
+            self._fit([unchanged], held=True)
+        best, refuted = self._most_probable(unchanged)
         good = sorted(
             (
                 reading
                 for reading, fit in self.fits.items()
-                if self._as_good(fit, self.fits[best]) and not self._alike(fit.error, refuted)
+                if self._fits_as_well(fit, self.fits[best]) and not self._is_close_to_any(fit.error, refuted)
             ),
-            key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
+            key=lambda reading: (
+                reading.changes,
+                reading.quarters != unchanged.quarters,
+                self.fits[reading].neg_log_posterior,
+            ),
         )
         others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
-        return as_it_is, good[0], others[: SearchSettings.listed]
+        return unchanged, good[0], others[: SearchSettings.listed]
 
     def carrying(self) -> list[Reading]:
         """Return the readings in which a joint's column includes, or lacks, a parallel joint before it."""
@@ -204,18 +208,18 @@ class ReadingSearch:
         p = self._parameters
         change = np.zeros(p.size)
         change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
-        drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
-        return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
+        predicted = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
+        return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(predicted, pairs, strict=True)])
 
     def is_certain(self, gain: float, share: float = 1.0) -> bool:
-        """Return True if the poses are sufficient evidence for a reading that fits better, as in `Poses.nats`."""
-        return self.poses.nats(gain, self.chain.joints, share) > SearchSettings.certain
+        """Return True if the poses are evidence enough for a reading that fits better; see `Poses.evidence_gain`."""
+        return self.poses.evidence_gain(gain, self.chain.joints, share) > SearchSettings.min_evidence
 
-    def placed_by(self, rows: NDArray[np.intp]) -> Placements:
+    def place_rows(self, rows: NDArray[np.intp]) -> Placements:
         """Place the nominal chain to sets of rows (s, n), with unchanged columns."""
         return place(self.chain, self.q[rows], self.x[rows], zeros_std=self._std, tool_std=LimitSettings.tool_m)
 
-    def on_hand(self, placed: Placements, one: int) -> FloatArray:
+    def offsets_on_hand(self, placed: Placements, one: int) -> FloatArray:
         """Return positions (n, 3) [m] relative to the marker, along the axes of its frame, by one of the placements."""
         p = self._parameters
         change = np.zeros(p.size)
@@ -233,97 +237,114 @@ class ReadingSearch:
             return None
         last = np.arange(self.chain.joints) == self.chain.joints - 1
         std = np.where(last, SearchSettings.last_zero_rad, self._std)
-        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)] + self._turned_alike(reading)
+        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)] + self._equivalent_turns(reading)
         fits = self._placed(turned, std=std, tool_m=LimitSettings.known_tool_m)
-        as_given = fits.pop(reading, None)
-        best = min(fits, key=lambda each: fits[each].nats + SearchSettings.a_change * each.changes, default=reading)
+        nominal_fit = fits.pop(reading, None)
+        best = min(
+            fits,
+            key=lambda each: fits[each].neg_log_posterior + SearchSettings.change_penalty * each.changes,
+            default=reading,
+        )
         if best not in turned or best == reading:
             return None
         fit = fits[best]
         # Without a fit, the known marker itself has led from this reading to another one.
-        clearly = as_given is None or fit.nats + SearchSettings.certain < as_given.nats
-        far = SearchSettings.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
-        return (best, fit) if clearly and far else None
+        is_clear = (
+            nominal_fit is None or fit.neg_log_posterior + SearchSettings.min_evidence < nominal_fit.neg_log_posterior
+        )
+        far = SearchSettings.nearer * fit.tool_m < (nominal_fit or self.fits[reading]).tool_m
+        return (best, fit) if is_clear and far else None
 
     def with_marker_nearer(self, reading: Reading) -> Reading | None:
         """Return the reading with other quarter turns and as good a fit that brings a distant marker near its place."""
-        best = min(self._turned_alike(reading), key=lambda each: self.fits[each].tool_m, default=reading)
+        best = min(self._equivalent_turns(reading), key=lambda each: self.fits[each].tool_m, default=reading)
         far = self.fits[reading].tool_m > SearchSettings.nearer * max(
             self.fits[best].tool_m, LimitSettings.known_tool_m
         )
         return best if far else None
 
-    def _turned_alike(self, reading: Reading) -> list[Reading]:
+    def _equivalent_turns(self, reading: Reading) -> list[Reading]:
         """Return the readings with other quarter turns that fit as well."""
         return [
             other
             for other, fit in self.fits.items()
             if other != reading
             and replace(other, quarters=reading.quarters) == reading
-            and self._as_good(fit, self.fits[reading])
+            and self._fits_as_well(fit, self.fits[reading])
         ]
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the joints whose sign makes no difference in any row, since some joints may move in few rows only."""
         plain, slides = Reading.plain(len(names)), self.chain.prismatic
         readings = list(itertools.islice(plain.neighbours(slides.tolist()), len(names)))
-        alike = [self._as_good(self.fits[one], self.fits[plain]) if one in self.fits else False for one in readings]
-        if not any(alike):
+        sign_is_free = [
+            self._fits_as_well(self.fits[one], self.fits[plain]) if one in self.fits else False for one in readings
+        ]
+        if not any(sign_is_free):
             return ()
-        own, *others = (
-            self._whole_error(one) if like else np.inf
-            for one, like in zip([plain, *readings], [True, *alike], strict=True)
+        own_error, *others = (
+            self._rms_of_all_rows(one) if free else np.inf
+            for one, free in zip([plain, *readings], [True, *sign_is_free], strict=True)
         )
-        return tuple(name for name, error in zip(names, others, strict=True) if error < THRESHOLDS.much_better * own)
+        return tuple(
+            name for name, error in zip(names, others, strict=True) if error < THRESHOLDS.much_better * own_error
+        )
 
-    def _whole_error(self, reading: Reading) -> float:
+    def _rms_of_all_rows(self, reading: Reading) -> float:
         """Return the RMS distance [m] of all rows, outliers included."""
         q, x = reading.angles(self.q, self.chain.prismatic), reading.positions(self.x)
         return max(float(np.sqrt(np.square(self.distances(q, x, [(q, x)])).mean())), self.exact_m)
 
     def _best(self) -> list[Reading]:
         return sorted(
-            self.fits, key=lambda reading: self.fits[reading].nats + SearchSettings.a_change * reading.changes
+            self.fits,
+            key=lambda reading: self.fits[reading].neg_log_posterior + SearchSettings.change_penalty * reading.changes,
         )
 
-    def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
+    def _most_probable(self, unchanged: Reading) -> tuple[Reading, list[float]]:
         """Return the most probable reading for links with tolerances, and the errors of better fits that it refutes.
 
         With nominal links a wrong reading may fit better, because its marker and joint offsets compensate errors of the
         links. This is only possible if the unchanged columns place the arm. These may themselves be the wrong reading
         that fits better.
         """
-        rivals, spread = self._distinct([]), spread_m(self.x)
-        own = self.fits.get(as_it_is)
+        candidates, spread = self._distinct([]), spread_m(self.x)
+        own = self.fits.get(unchanged)
         if own is None or own.error >= THRESHOLDS.named * spread:
-            return rivals[0], []
-        nearest = rivals[0]
-        if nearest == as_it_is:
-            rivals = [each for each in rivals if nameable(each, self.fits[each], spread)]
-        rivals += [as_it_is] if as_it_is not in rivals else []
-        if rivals == [as_it_is]:
-            return as_it_is, []
+            return candidates[0], []
+        nearest = candidates[0]
+        if nearest == unchanged:
+            candidates = [each for each in candidates if nameable(each, self.fits[each], spread)]
+        candidates += [unchanged] if unchanged not in candidates else []
+        if candidates == [unchanged]:
+            return unchanged, []
         slides = self.chain.prismatic
-        read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
-        changes = np.array([reading.changes for reading in rivals])
-        probable = evidences(self.chain, read, self.poses.rows) - SearchSettings.a_change * changes
+        read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in candidates]
+        changes = np.array([reading.changes for reading in candidates])
+        log_probabilities = log_evidences(self.chain, read, self.poses.rows) - SearchSettings.change_penalty * changes
         # If the unchanged columns fit best, another reading needs twice the usual certainty.
-        probable[rivals.index(as_it_is)] += 2.0 * SearchSettings.certain if nearest == as_it_is else 0.0
-        best = rivals[int(probable.argmax())]
-        nats, error = self.fits[best].nats, self.fits[best].error
-        fits = [self.fits[reading] for reading in rivals]
-        return best, [fit.error for fit in fits if fit.nats < nats and not self._alike(error, [fit.error])]
+        log_probabilities[candidates.index(unchanged)] += (
+            2.0 * SearchSettings.min_evidence if nearest == unchanged else 0.0
+        )
+        best = candidates[int(log_probabilities.argmax())]
+        neg_log_posterior, error = self.fits[best].neg_log_posterior, self.fits[best].error
+        fits = [self.fits[reading] for reading in candidates]
+        return best, [
+            fit.error
+            for fit in fits
+            if fit.neg_log_posterior < neg_log_posterior and not self._is_close_to_any(error, [fit.error])
+        ]
 
     @staticmethod
-    def _alike(error: float, others: list[float]) -> bool:
-        return any(abs(error - other) <= SearchSettings.same * other for other in others)
+    def _is_close_to_any(error: float, others: list[float]) -> bool:
+        return any(abs(error - other) <= SearchSettings.same_error * other for other in others)
 
     def _distinct(self, expanded: list[Reading]) -> list[Reading]:
         """Return the best readings whose fits differ from those already expanded, and from each other."""
         seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
         for reading in self._best():
             error = self.fits[reading].error
-            if not self._alike(error, seen):
+            if not self._is_close_to_any(error, seen):
                 new.append(reading)
                 seen.append(error)
             if len(new) == SearchSettings.width:
@@ -331,8 +352,11 @@ class ReadingSearch:
         return new
 
     @staticmethod
-    def _as_good(fit: ReadingFit, best: ReadingFit) -> bool:
-        return fit.nats < best.nats + SearchSettings.certain or fit.error < THRESHOLDS.as_good * best.error
+    def _fits_as_well(fit: ReadingFit, best: ReadingFit) -> bool:
+        return (
+            fit.neg_log_posterior < best.neg_log_posterior + SearchSettings.min_evidence
+            or fit.error < THRESHOLDS.as_good * best.error
+        )
 
     def _try(self, readings: Iterable[Reading]) -> None:
         new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
@@ -348,7 +372,7 @@ class ReadingSearch:
         """
         std = self._std * (SearchSettings.held if held else 1.0)
         for reading, fit in self._placed(new, std=std, tools=tools).items():
-            if reading not in self.fits or fit.nats < self.fits[reading].nats:
+            if reading not in self.fits or fit.neg_log_posterior < self.fits[reading].neg_log_posterior:
                 self.fits[reading] = fit
 
     def _placed(
@@ -383,12 +407,14 @@ class ReadingSearch:
                 0.0 if r.mirrored else 0.5 * (turn / THRESHOLDS.turned_rad) ** 2
                 for r, turn in zip(new, turns, strict=True)
             ]
-        nats = 3.0 * LimitSettings.measured_share * len(self.poses.rows) * np.log(errors) + cost
+        neg_log_posterior = 3.0 * LimitSettings.measured_share * len(self.poses.rows) * np.log(errors) + cost
         fits: dict[Reading, ReadingFit] = {}
         for k, reading in enumerate(new):
             found = reading.turned(quarters[k].tolist())
-            fit = ReadingFit(float(errors[k]), float(nats[k]), zeros[k], float(moved[k]), placed.rotations[k])
-            if found not in fits or fit.nats < fits[found].nats:
+            fit = ReadingFit(
+                float(errors[k]), float(neg_log_posterior[k]), zeros[k], float(moved[k]), placed.rotations[k]
+            )
+            if found not in fits or fit.neg_log_posterior < fits[found].neg_log_posterior:
                 fits[found] = fit
         return fits
 

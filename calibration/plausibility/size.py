@@ -48,7 +48,7 @@ class Size:
         return abs(math.log(self.factor)) / self.log_sigma
 
 
-def of_another_size(size: Size, spread: float, before: float, best: float) -> Plausibility | None:
+def wrong_size(size: Size, spread: float, before: float, best: float) -> Plausibility | None:
     """Return the verdict on positions that are too large or too small for the arm; None if they are not.
 
     Args:
@@ -92,7 +92,7 @@ def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: NDArray[np.i
     return Size(math.exp(log), sigma, max(math.exp(log) * error, exact_m))
 
 
-def evidences(
+def log_evidences(
     chain: RigidChain, readings: list[tuple[FloatArray, FloatArray, float]], apart: NDArray[np.intp]
 ) -> FloatArray:
     """Return the log evidence (m,) of readings of the same pairs; links and size may be off by tolerances.
@@ -105,7 +105,7 @@ def evidences(
     good = np.all([_is_near(each.distances[0]) for each in placed], axis=0)
     found: list[float] = []
     for at, (q, x, scale) in zip(placed, readings, strict=True):
-        logs = _evidences(chain, q[apart], at, x[apart], good)[0]
+        logs = _evidence_by_tolerances(chain, q[apart], at, x[apart], good)[0]
         found.append(logs.max() + np.log(np.exp(logs - logs.max()).mean()) - 3.0 * good.sum() * math.log(scale))
     return np.array(found)
 
@@ -117,7 +117,7 @@ def _placed(chain: RigidChain, q: FloatArray, x: FloatArray) -> Placements:
 
 def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray) -> tuple[float, float]:
     """Return mean and 1-sigma of the logarithm of the positions' size, over all tolerances and noise levels."""
-    evidence, means, variances = _evidences(chain, q, placed, x, _is_near(placed.distances[0]))
+    evidence, means, variances = _evidence_by_tolerances(chain, q, placed, x, _is_near(placed.distances[0]))
     shares = np.exp(evidence - evidence.max())
     shares /= shares.sum()
     mean = float(shares @ means)
@@ -128,7 +128,9 @@ def _is_near(distances: FloatArray) -> BoolArray:
     return distances <= _Settings.far_row * np.median(distances)
 
 
-def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray, good: BoolArray) -> FloatArray:
+def _evidence_by_tolerances(
+    chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray, good: BoolArray
+) -> FloatArray:
     """Return log evidence, mean and variance (3, k) of the size from `good` rows, by tolerances and noise level."""
     distances, parameters = placed.distances[0], ChainParameters(chain)
     change = np.zeros(parameters.size)
@@ -147,11 +149,13 @@ def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArr
     both = np.stack([residuals, larger])
     within = both @ basis
     beyond = (both - within @ basis.T) @ (both - within @ basis.T).T
-    found = [_posteriors(effects @ made, within, beyond, noises, len(residuals)) for made in _made(parameters)]
+    found = [
+        _posteriors(effects @ made, within, beyond, noises, len(residuals)) for made in _tolerance_roots(parameters)
+    ]
     return np.concatenate(found, axis=1)
 
 
-def _made(parameters: ChainParameters) -> Iterator[FloatArray]:
+def _tolerance_roots(parameters: ChainParameters) -> Iterator[FloatArray]:
     """Yield roots (p, k) of the covariance for each of the tolerances, and the same with one link of any length."""
     _, _, tangents, _, marker = parameters.tables
     joints = len(tangents)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.whole_files import write_whole, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, write_atomically
 from bodyschema.vision.printing import Page, pdf, svg
 
 _WRITERS = {".pdf": pdf, ".svg": svg}
@@ -16,8 +16,8 @@ def write_page(page: Page, out: Path) -> tuple[float, float]:
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:
         raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
-    with writing(out, remedy="Name another folder"):
-        write_whole({out: writer(page)})
+    with raising_write_errors(out, remedy="Name another folder"):
+        write_atomically({out: writer(page)})
     return page.rulers_mm
 
 

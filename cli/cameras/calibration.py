@@ -20,12 +20,12 @@ from bodyschema.cli.terminal.screen import ruled_table
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_atomically
 from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
 from bodyschema.vision.board.page import page as board_page
-from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
+from bodyschema.vision.calibration.calibrate import Calibrated, CalibrationRequest, calibrate
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
 from bodyschema.vision.calibration.image_pairs import ImagePair, Images, read_pairs, write_pair
@@ -148,13 +148,13 @@ def board_of(
     return Board(int(read[1]), int(read[2]), 1e-3 * square_mm, _metres(marker_mm), dictionary, pattern)
 
 
-def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
+def as_printed(nominal: Board, ruler_mm: float | None) -> Board:
     """Return the board as printed: its page's longer ruler measures `ruler_mm`; raise ConfigError if implausible."""
     if ruler_mm is None:
-        return drawn
-    width, height = drawn.size_m
+        return nominal
+    width, height = nominal.size_m
     scale = printed_scale(rulers_mm((1e3 * width, 1e3 * height))[0], ruler_mm)
-    return replace(drawn, square_m=scale * drawn.square_m, marker_m=scale * drawn.marker_side_m)
+    return replace(nominal, square_m=scale * nominal.square_m, marker_m=scale * nominal.marker_side_m)
 
 
 def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
@@ -188,16 +188,18 @@ def calibrated(found: Gathered, known: KnownCameras, tell: Tell, serials: Sequen
     Raises:
         CalibrationError: the result is not good enough; the message has the reasons.
     """
-    given = (known.left_serial, known.right_serial)
-    asked = Asked(
+    known_serials = (known.left_serial, known.right_serial)
+    request = CalibrationRequest(
         image_size_px=found.image_size_px,
-        serials=tuple(own or told for own, told in zip(given, serials, strict=False))[: len(found.eyes)],
+        serials=tuple(
+            known_serial or connected for known_serial, connected in zip(known_serials, serials, strict=False)
+        )[: len(found.eyes)],
         date=SystemClock().utc(),
         model=known.lens,
         scale_sigma=0.01 * known.scale_sigma_percent,
         baseline_m=_metres(known.baseline_mm),
     )
-    return calibrate(found.views, found.board, asked, tell)
+    return calibrate(found.views, found.board, request, tell)
 
 
 def live_views(board: Board, eyes: int) -> LiveViews:
@@ -214,7 +216,7 @@ def write_calibrated_cameras(result: Calibrated, found: Gathered, out: Path) -> 
     """Write cameras.toml with its report beside it, and return the report's path."""
     write_rig(result.rig, out)
     report = out.with_name(f"{out.stem}_{REPORT}")
-    write_whole({report: report_page(result, found).encode()})
+    write_atomically({report: report_page(result, found).encode()})
     return report
 
 
@@ -236,13 +238,13 @@ def figures(
         model=rig.model,
         image_size_px=rig.image_size_px,
         serials=rig.serials,
-        board=rig.made.board,
+        board=rig.provenance.board,
         baseline_mm=None if pair is None else 1e3 * pair.baseline_m,
         baseline_half_width_mm=None if pair is None else 1e3 * NORMAL_95 * pair.baseline_sigma_m,
         position_half_widths_mm=(across, down, ahead),
-        reprojection_px=rig.made.reprojection_px,
-        held_out_px=rig.made.held_out_px,
-        held_out_by_model_px={str(model): px for model, px in result.rivals_px.items()},
+        reprojection_px=rig.provenance.reprojection_px,
+        held_out_px=rig.provenance.held_out_px,
+        held_out_by_model_px={str(model): px for model, px in result.held_out_by_model_px.items()},
         rectified_focal_px=Rectification(rig).calibration.focal_px,
         parameters=[Parameter(*each) for each in zip(rig.names, rig.vector.tolist(), widths.tolist(), strict=True)],
         views=[ViewFigures(view.name, rms, held_out) for view, rms, held_out in errors],
@@ -353,35 +355,35 @@ def check_view(found: CheckFile, name: str) -> Group:
 
 
 def _sentences(found: CamerasFile, wishes: int = 3) -> list[str]:
-    said: list[str] = []
+    lines: list[str] = []
     if found.baseline_mm is not None:
-        said.append(f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %).")
+        lines.append(f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %).")
     across, down, ahead = found.position_half_widths_mm
     marker = "Positions" if found.baseline_mm is not None else "Tags of exactly known size"
-    said.append(
+    lines.append(
         f"{marker} {CommonErrorSettings.ahead_m:g} m ahead are known to ± {across:.2f} mm across, {down:.2f} down, "
         f"{ahead:.2f} in depth (95 %), as far as the calibration goes."
     )
-    said.append(
+    lines.append(
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
         f"{found.reprojection_px:.3f}); {len(found.views)} views of {found.board}. {_rivals(found)}"
     )
-    said.extend(f"Warning: {text}." for text in found.refocused)
+    lines.extend(f"Warning: {text}." for text in found.refocused)
     if found.left_out:
         names = "; ".join(f"{each.name} ({each.rms_px:.2f} px, others {each.usual_px:.2f})" for each in found.left_out)
-        said.append(f"Left out, since they do not fit the others: {names}.")
+        lines.append(f"Left out, since they do not fit the others: {names}.")
     if found.unusable:
-        said.append(f"{len(found.unusable)} images could not be used; the report names them.")
+        lines.append(f"{len(found.unusable)} images could not be used; the report names them.")
     # The size of the board changes its distance, but not the lens.
     if not found.size_was_measured and found.baseline_mm is not None:
-        said.append(
+        lines.append(
             "No image shows whether the board has its stated size: measure the line below it and give --ruler-mm, "
             "or the distance of the lenses and give --baseline-mm."
         )
     if found.missing:
         more = "" if len(found.missing) <= wishes else f"; and {len(found.missing) - wishes} more, in the report"
-        said.append(f"It would be better with: {'; '.join(found.missing[:wishes])}{more}.")
-    return said
+        lines.append(f"It would be better with: {'; '.join(found.missing[:wishes])}{more}.")
+    return lines
 
 
 def _rivals(found: CamerasFile) -> str:

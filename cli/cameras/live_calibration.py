@@ -44,7 +44,7 @@ class Shown:
     doing: str = ""  # present computation; empty while views are taken
 
     @property
-    def wish(self) -> str:
+    def next_step(self) -> str:
         """Advice on the next view."""
         missing = self.coverage.missing()
         if missing:
@@ -217,7 +217,7 @@ def screen(shown: Shown, heading: str) -> Group:
     texts = [
         Text(f"{heading}: {count}", style="bold"),
         Text(""),
-        Text(f"Next: {shown.wish}", style="bold cyan"),
+        Text(f"Next: {shown.next_step}", style="bold cyan"),
         Text(f"Now:  {now_text(shown)}", style="green" if _is_taken(shown.look) else ""),
         Text(""),
         parts,
@@ -279,24 +279,24 @@ class Lines:
         self._next_s = 0.0
         self._said: set[str] = set()  # since the last view
         self._complaints: set[str] = set()
-        self._wish = ""
+        self._last_step = ""
 
     def __call__(self, shown: Shown) -> None:
         """Print the news."""
         for text in (shown.refusal and f"not good enough yet: {shown.refusal}", *shown.trouble):
             self._once(text, self._complaints)
-        if _is_taken(shown.look) or (shown.wish != self._wish and not shown.doing):
-            self._wish = shown.wish
-            said = f"{shown.coverage.whole_views} views, {shown.coverage.progress:.0%}. Next: {shown.wish}"
-            self._say(f"{now_text(shown)}. {said}" if _is_taken(shown.look) else said)
+        if _is_taken(shown.look) or (shown.next_step != self._last_step and not shown.doing):
+            self._last_step = shown.next_step
+            progress = f"{shown.coverage.whole_views} views, {shown.coverage.progress:.0%}. Next: {shown.next_step}"
+            self._say(f"{now_text(shown)}. {progress}" if _is_taken(shown.look) else progress)
             self._said.clear()
         elif shown.doing or (shown.look is not None and self._clock.now() >= self._next_s):
             self._next_s = self._clock.now() + Waits.line_every_s
             self._once(now_text(shown), self._said)
 
-    def _once(self, text: str, said: set[str]) -> None:
-        if text and text not in said:
-            said.add(text)
+    def _once(self, text: str, shown: set[str]) -> None:
+        if text and text not in shown:
+            shown.add(text)
             self._say(text)
 
 

@@ -16,7 +16,7 @@ from bodyschema.daemon.service.local_web import HEADERS, LOOPBACK, host_refusal
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Source
 from bodyschema.interfaces.records import ImageArray
-from bodyschema.interfaces.whole_files import writing
+from bodyschema.interfaces.whole_files import raising_write_errors
 from bodyschema.vision.image_file import jpeg
 
 
@@ -41,7 +41,7 @@ class Watching:
     @classmethod
     def into(cls, folder: Path, pictures: Pictures, *, every_s: float, count: int | None) -> Self:
         """Write pictures into files 000001.jpg and so on; raise ConfigError if the folder cannot be created."""
-        with writing(folder, what="made", remedy="Give another --out"):
+        with raising_write_errors(folder, what="made", remedy="Give another --out"):
             folder.mkdir(parents=True, exist_ok=True)
         numbers = itertools.count(1)
         return cls(
@@ -69,7 +69,7 @@ class Watching:
 
 
 def _write(file: Path, data: bytes) -> None:
-    with writing(file, remedy="Give another --out"):
+    with raising_write_errors(file, remedy="Give another --out"):
         file.write_bytes(data)
 
 
@@ -152,9 +152,9 @@ class MjpegServer:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                said = host_refusal(self.headers.get_all("Host", []))
-                if said is not None:
-                    self._say(403, said)
+                refusal = host_refusal(self.headers.get_all("Host", []))
+                if refusal is not None:
+                    self._say(403, refusal)
                 elif self.path == "/":
                     self._send(200, "text/html; charset=utf-8", PAGE)
                 elif self.path != "/stream":

@@ -15,7 +15,7 @@ from rich.console import Console
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Board, Images
-    from bodyschema.cli.recordings.diagnosis import Asked
+    from bodyschema.cli.recordings.diagnosis import DiagnosisSettings
     from bodyschema.daemon.config import Config
 
 
@@ -78,11 +78,11 @@ class SearchOptions:
     exclude: Annotated[str | None, Parameter(help="Do not look for these.")] = None
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0
 
-    def asked(self) -> Asked:
+    def settings(self) -> DiagnosisSettings:
         """Return the effects to look for; raise RequestError for an unknown one."""
-        from bodyschema.cli.recordings.diagnosis import Asked
+        from bodyschema.cli.recordings.diagnosis import DiagnosisSettings
 
-        return Asked.of(self.effects, self.exclude, self.seed)
+        return DiagnosisSettings.of(self.effects, self.exclude, self.seed)
 
 
 ANYTHING = SearchOptions()
@@ -121,8 +121,8 @@ class LeRobotOptions:
         if self.lerobot is None:
             return []
         corrected = CorrectedCalibration.of(config, self.lerobot, offsets_rad)
-        if already := corrected.already(recording):
-            return already
+        if already_written := corrected.already_written(recording):
+            return already_written
         lines = difference(corrected)
         if not any(change.ticks for change in corrected.changes):
             return lines
@@ -165,8 +165,8 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
     """Return `given`, else the robot.toml beside `source`, else that of the environment or the working directory."""
     if given is not None:
         return given
-    if source is not None and (beside := source.parent / HERE).exists():
-        return beside
+    if source is not None and (sibling := source.parent / HERE).exists():
+        return sibling
     return Path(os.environ.get(VARIABLE, HERE))
 
 
@@ -197,7 +197,7 @@ class PrintedBoard:
         ),
     ] = None
 
-    def drawn(self) -> Board:
+    def nominal_board(self) -> Board:
         """Return the board in its nominal size; raise ConfigError if the options describe no valid one."""
         from bodyschema.cli.cameras.calibration import board_of
 
@@ -209,7 +209,7 @@ class PrintedBoard:
         """Return the board in its printed size; raise ConfigError if the options describe no valid one."""
         from bodyschema.cli.cameras.calibration import as_printed
 
-        return as_printed(self.drawn(), self.ruler_mm)
+        return as_printed(self.nominal_board(), self.ruler_mm)
 
 
 @Parameter(name="*")

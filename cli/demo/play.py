@@ -30,7 +30,7 @@ from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import end, module_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.online_learner import OnlineSettings
-from bodyschema.learning.status import Outlook
+from bodyschema.learning.status import DataOutlook
 from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain, nearest_rotation, rotation_matrices, rotation_vectors
 
@@ -53,7 +53,7 @@ class CurveRow:
 
     pairs: int
     truth_m: float
-    claimed_m: float | None
+    predicted_m: float | None
     prequential_m: float | None
     nominal_m: float
     angle_rad: float | None = None
@@ -67,7 +67,7 @@ def write_curve(rows: Sequence[CurveRow], file: Path) -> None:
         heading = ["pairs", "held_out_error_mm", "claimed_error_mm", "prequential_error_mm", "nominal_error_mm"]
         writer.writerow([*heading, "held_out_angle_deg"] if turned else heading)
         for row in rows:
-            errors = (row.truth_m, row.claimed_m, row.prequential_m, row.nominal_m)
+            errors = (row.truth_m, row.predicted_m, row.prequential_m, row.nominal_m)
             angle = "" if row.angle_rad is None else f"{math.degrees(row.angle_rad):.4f}"
             cells = ["" if e is None else f"{1e3 * e:.3f}" for e in errors]
             writer.writerow([row.pairs, *cells, angle] if turned else [row.pairs, *cells])
@@ -78,7 +78,7 @@ def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> N
     curves = {
         "nominal model": ("nominal", [row.nominal_m for row in rows]),
         "error on each new sample before it is learnt": ("next", [row.prequential_m for row in rows]),
-        "error that the learner expects": ("expected", [row.claimed_m for row in rows]),
+        "error that the learner expects": ("expected", [row.predicted_m for row in rows]),
         "ground truth: error on held-out poses": ("truth", [row.truth_m for row in rows]),
     }
     known = [1e3 * error for _, errors in curves.values() for error in errors if error]
@@ -135,7 +135,7 @@ class Verdict:
     angles_within_sigma: float | None = None  # share of the angles' components within the predicted 1-sigma
 
 
-class Judge:
+class Evaluation:
     """Evaluation of the learner's answers against the simulated ground truth."""
 
     def __init__(self, robot: RobotDescription, sampler: ZenohSession, learner: ZenohSession, seed: int) -> None:
@@ -150,7 +150,7 @@ class Judge:
         """Number of accepted pairs fetched so far."""
         return len(self._seen)
 
-    def follow(self) -> None:
+    def fetch_pairs(self) -> None:
         """Fetch the joint angles of the pairs accepted since the last call."""
         while True:
             request = f"{self._keys.pairs}?from={len(self._seen) + 1}"
@@ -177,7 +177,7 @@ class Judge:
 
     def verdict(self) -> Verdict | None:
         """Evaluate the learner's current answers; return None before any pair."""
-        self.follow()
+        self.fetch_pairs()
         region = self._seen[self._region_start :]
         if not len(region):
             return None
@@ -209,7 +209,7 @@ def _turned(answer: PredictReply, truth: FloatArray) -> dict[str, float]:
     }
 
 
-class Asker:
+class PredictionLines:
     """Output of the asking process."""
 
     def __init__(self, lines: queue.SimpleQueue[bytes]) -> None:
@@ -222,23 +222,23 @@ class Asker:
     def update(self) -> None:
         """Read its output since the last call."""
         while not self._lines.empty():
-            said = json.loads(self._lines.get())
-            self.answers += said["answers"]
-            self.unanswered += said["unanswered"] + said["refused"]
-            self.p50_ms, self.worst_ms = said["p50_ms"], said["worst_ms"]
+            report = json.loads(self._lines.get())
+            self.answers += report["answers"]
+            self.unanswered += report["unanswered"] + report["refused"]
+            self.p50_ms, self.worst_ms = report["p50_ms"], report["worst_ms"]
 
 
 @contextmanager
-def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
+def started_query_load(scene: Scene, seed: int) -> Iterator[PredictionLines]:
     """Run a process that asks for predictions until the end of the with statement."""
-    command = module_command("bodyschema.cli.demo.asker", str(scene.robot_file), str(seed))
+    command = module_command("bodyschema.cli.demo.query_load", str(scene.robot_file), str(seed))
     lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     reader = threading.Thread(target=_collect, args=(process.stdout, lines), name="asker's lines")
     reader.start()
     try:
-        yield Asker(lines)
+        yield PredictionLines(lines)
     finally:
         end(process, ProcessSettings.end_limit_s)
         reader.join()
@@ -255,7 +255,7 @@ class Snapshot:
     """The data that the view shows."""
 
     target: int
-    asker: Asker
+    asker: PredictionLines
     phase: str
     sampler: SamplerStatus
     learner: LearnerStatus
@@ -268,9 +268,9 @@ class Chapter:
 
     pairs: int  # number of pairs learnt with this part's tool
     verdict: Verdict  # errors against the ground truth
-    claimed_m: float | None  # predicted error [m], or None
+    predicted_m: float | None  # predicted error [m], or None
     claimed_rad: float | None  # predicted error of the marker's orientation [rad], or None
-    outlook: Outlook | None  # expected gain of further pairs, or None
+    outlook: DataOutlook | None  # expected gain of further pairs, or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +306,7 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         daemon.wait_for(endpoints.learner, keys.alive("learner"))
         sampler = stack.enter_context(ZenohSession(connect=endpoints.sampler, client=True))
         learner = stack.enter_context(ZenohSession(connect=endpoints.learner, client=True))
-        asker = stack.enter_context(started_asker(scene, seed))
+        asker = stack.enter_context(started_query_load(scene, seed))
         stage = _Stage(config, daemon, sampler, learner, asker, show, seed)
         before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first + second)
         changed_at = stage.change_tool()
@@ -328,14 +328,14 @@ class _Stage:
     daemon: Process
     sampler: ZenohSession
     learner: ZenohSession
-    asker: Asker
+    asker: PredictionLines
     show: Callable[[Snapshot], None]
     seed: int
     rows: list[CurveRow] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._keys = Keys(self.config.robot.name)
-        self._judge = Judge(self.config.robot, self.sampler, self.learner, self.seed)
+        self._evaluation = Evaluation(self.config.robot, self.sampler, self.learner, self.seed)
 
     def learn(self, pairs: int, phase: str, target: int) -> Chapter:
         """Wait until the learner has learnt `pairs` pairs with the present tool."""
@@ -355,9 +355,11 @@ class _Stage:
             self.asker.update()
             self.show(snapshot)
             if done and snapshot.verdict is not None:
-                told = snapshot.learner
-                claimed_rad = None if told.orientation is None else told.orientation.claimed_rad
-                return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, claimed_rad, told.outlook)
+                status = snapshot.learner
+                claimed_rad = None if status.orientation is None else status.orientation.claimed_rad
+                return Chapter(
+                    status.pairs - begin, snapshot.verdict, status.claimed_error_m, claimed_rad, status.outlook
+                )
             if time.monotonic() - progress_at > _Settings.stall_limit_s:
                 raise BusError(stalled(snapshot.sampler))
             time.sleep(_Settings.glance_s)
@@ -368,26 +370,26 @@ class _Stage:
         Return the earlier pairs' number.
         """
         self._command("sampler", "pause")
-        self._judge.follow()
-        while self._learner_status().last_seq < self._judge.seen:
+        self._evaluation.fetch_pairs()
+        while self._learner_status().last_seq < self._evaluation.seen:
             self.daemon.check()
             time.sleep(0.05)
-        changed_at = self._judge.seen
+        changed_at = self._evaluation.seen
         marker = np.array(self.config.robot.robot.marker_xyz)
-        self._judge.change_tool(marker * (1.0 + _Settings.tool_length_m / float(np.linalg.norm(marker))))
-        self._judge.new_region()
+        self._evaluation.change_tool(marker * (1.0 + _Settings.tool_length_m / float(np.linalg.norm(marker))))
+        self._evaluation.new_region()
         self._command("learner", "tool_changed")
         self._command("sampler", "resume")
         return changed_at
 
     def _verdict(self, learner: LearnerStatus) -> Verdict | None:
-        verdict = self._judge.verdict()
+        verdict = self._evaluation.verdict()
         if verdict is not None:
             self.rows.append(
                 CurveRow(
                     pairs=verdict.pairs,
                     truth_m=verdict.error_m,
-                    claimed_m=learner.claimed_error_m,
+                    predicted_m=learner.claimed_error_m,
                     prequential_m=learner.prequential_m.get(learner.answering),
                     nominal_m=verdict.nominal_m,
                     angle_rad=verdict.angle_rad,

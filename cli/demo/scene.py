@@ -14,7 +14,7 @@ from bodyschema.cli.replay.processes import free_endpoint
 from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import writing
+from bodyschema.interfaces.whole_files import raising_write_errors
 from bodyschema.robot.description import RobotDescription
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def prepare(
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
     """
     model = demonstration_model()
-    with writing(folder, remedy="Give another --out or free some space"):
+    with raising_write_errors(folder, remedy="Give another --out or free some space"):
         folder.mkdir(parents=True, exist_ok=True)
         found = sorted(path.name for path in folder.iterdir())
         if found and MARK not in found:

@@ -38,7 +38,7 @@ class _Lines:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._next = 0.0
-        self._phase = self._said = ""
+        self._phase = self._last_line = ""
 
     def __call__(self, snapshot: Snapshot) -> None:
         if snapshot.phase != self._phase:
@@ -51,14 +51,14 @@ class _Lines:
         truth, what = mm(verdict.error_m) if verdict else "-", "error: "
         if verdict and verdict.angle_rad is not None:
             truth, what = f"{truth} {degrees(verdict.angle_rad)}", ""  # no room for both
-        said = (
+        line = (
             f"{learner.pairs:5d} of {snapshot.target} pairs; "
             f"{what}next pair {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, held out {truth}"
         )
-        if said != self._said:
-            self._said = said
-            self._console.print(said, soft_wrap=True)
+        if line != self._last_line:
+            self._last_line = line
+            self._console.print(line, soft_wrap=True)
 
 
 def _screen(snapshot: Snapshot) -> RenderableType:
@@ -126,7 +126,7 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
             str(chapter.pairs),
             mm(chapter.verdict.nominal_m),
             Text(mm(chapter.verdict.error_m), style="bold green"),
-            mm(chapter.claimed_m),
+            mm(chapter.predicted_m),
             f"{100 * chapter.verdict.within_sigma:.0f} %",
         )
     console.print()

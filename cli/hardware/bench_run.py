@@ -110,10 +110,10 @@ class BenchRun:
     def due(self) -> Iterator[str]:
         """Perform the actions that are due, and yield a message for each."""
         while self._next is not None and self._now() >= self._next[0]:
-            at, said, act = self._next
+            at, message, act = self._next
             act()
             self._plan_next(at)
-            yield said
+            yield message
 
     def introduction(self) -> Iterator[str]:
         """Yield a description of the emulation, and the commands to type in another terminal."""

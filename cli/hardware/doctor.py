@@ -88,17 +88,17 @@ def _description(config: Config) -> Iterator[Check]:
         "robot.toml", "ok", f"{config.file} is in order: {config.robot.name}, {len(config.robot.joints)} joints"
     )
     if config.tables.drivers.hardware is None:
-        said = "no servos are configured, so none were looked at"
-        yield Check("robot.toml", "warning", said, "bodyschema init --urdf YOUR.urdf --from scan")
+        message = "no servos are configured, so none were looked at"
+        yield Check("robot.toml", "warning", message, "bodyschema init --urdf YOUR.urdf --from scan")
     cameras = config.tables.vision.cameras
     if cameras is not None and cameras.calibration is not None:
         return
     if cameras is None and config.tables.marker_source:
         return
     if config.robot.calibration is None:
-        said = "[camera] does not describe how the cameras see: images cannot be used, recordings can"
+        message = "[camera] does not describe how the cameras see: images cannot be used, recordings can"
         keys = "focal_px, principal_point_px, image_size_px, and baseline_m or eyes = 1"
-        yield Check("camera", "warning", said, f"add {keys} to [camera]")
+        yield Check("camera", "warning", message, f"add {keys} to [camera]")
     else:
         what = "a stereo pair" if config.robot.calibration.is_stereo else "one camera"
         yield Check("camera", "ok", f"[camera] describes {what}")
@@ -167,22 +167,22 @@ def _of_the_sampler(config: Config) -> Iterator[Check]:
 def disk_checks(folder: Path) -> Iterator[Check]:
     """Yield checks of free space and write permission for the pairs in `folder`."""
     try:
-        there = next(path for path in (folder, *folder.parents) if path.exists())
+        existing = next(path for path in (folder, *folder.parents) if path.exists())
     except PermissionError as error:
         remedy = "bodyschema run --state-dir FOLDER    # one that you can write"
         yield Check("disk", "wrong", f"{folder}, where pairs are to be kept, is not yours: {error.strerror}", remedy)
         return
-    if not os.access(there, os.W_OK):
-        said = f"{there} cannot be written, and pairs are to be kept in {folder}"
-        yield Check("disk", "wrong", said, f"sudo chown $USER {there}")
+    if not os.access(existing, os.W_OK):
+        message = f"{existing} cannot be written, and pairs are to be kept in {folder}"
+        yield Check("disk", "wrong", message, f"sudo chown $USER {existing}")
         return
-    free = shutil.disk_usage(there).free
-    said = f"{free / 2**30:.1f} GiB are free for {folder}"
+    free = shutil.disk_usage(existing).free
+    message = f"{free / 2**30:.1f} GiB are free for {folder}"
     if free < 5 * LOW_DISK_BYTES:
         state = "wrong" if free < LOW_DISK_BYTES else "warning"
-        yield Check("disk", state, said, f"du -xh {there} | sort -h | tail    # what could go")
+        yield Check("disk", state, message, f"du -xh {existing} | sort -h | tail    # what could go")
     else:
-        yield Check("disk", "ok", said)
+        yield Check("disk", "ok", message)
 
 
 def store_checks(file: Path) -> Iterator[Check]:
@@ -190,15 +190,15 @@ def store_checks(file: Path) -> Iterator[Check]:
     with PairReader(file) as pairs:
         trouble, audit = pairs.trouble(), pairs.audit()
     if trouble is not None:
-        said = f"{file} is damaged ({trouble}). The sampler puts what can be read into a new file when it starts"
-        yield Check("store", "wrong", said, "bodyschema backup before.zip")
+        message = f"{file} is damaged ({trouble}). The sampler puts what can be read into a new file when it starts"
+        yield Check("store", "wrong", message, "bodyschema backup before.zip")
     elif audit.damage.count:
         yield Check(
-            "store", "warning", audit.damage.told(file), f"sudo smartctl -a $(df --output=source {file} | tail -1)"
+            "store", "warning", audit.damage.sentence(file), f"sudo smartctl -a $(df --output=source {file} | tail -1)"
         )
     elif audit.lost_rows:
-        said = f"{audit.lost_rows} notes on runs or servos in {file} cannot be read: the disk changed them"
-        yield Check("store", "warning", said, "bodyschema backup before.zip")
+        message = f"{audit.lost_rows} notes on runs or servos in {file} cannot be read: the disk changed them"
+        yield Check("store", "warning", message, "bodyschema backup before.zip")
     else:
         yield Check("store", "ok", f"all {audit.pairs} pairs in {file} are as they were written")
 
@@ -211,8 +211,8 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
     elif known:
         yield Check("clock", "ok", "kept right by the network")
     else:
-        said = "the wall clock is not kept right by the network"
-        yield Check("clock", "warning", said, "sudo timedatectl set-ntp true")
+        message = "the wall clock is not kept right by the network"
+        yield Check("clock", "warning", message, "sudo timedatectl set-ntp true")
 
 
 def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
@@ -221,8 +221,8 @@ def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
     for file in sorted(files):
         if OLD_UNIT.search(file.read_text(encoding="utf-8", errors="replace")):
             fix = "install router" if "router" in file.name else "install service"
-            said = f"{file} starts `python -m daemon`, which this bodyschema does not have"
-            yield Check("service", "wrong", said, f'sudo "$(command -v bodyschema)" {fix}')
+            message = f"{file} starts `python -m daemon`, which this bodyschema does not have"
+            yield Check("service", "wrong", message, f'sudo "$(command -v bodyschema)" {fix}')
 
 
 def _is_synchronised() -> bool | None:
@@ -260,8 +260,8 @@ def zenoh_check(process: str, route: Route, token: str) -> Check:
     if is_alive(route, token, open_timeout_s=_Settings.open_s):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
     port = endpoint.rpartition(":")[2]
-    said = f"another program listens on {endpoint}, where the {process} should"
-    return Check("zenoh", "wrong", said, f"ss -ltnp 'sport = :{port}'    # who it is; or another port in [zenoh]")
+    message = f"another program listens on {endpoint}, where the {process} should"
+    return Check("zenoh", "wrong", message, f"ss -ltnp 'sport = :{port}'    # who it is; or another port in [zenoh]")
 
 
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:

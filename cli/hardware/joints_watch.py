@@ -59,7 +59,7 @@ class JointState(msgspec.Struct, frozen=True):
         return JointRange(self.low, self.high, self.lower, self.upper)
 
 
-class Seen(msgspec.Struct, frozen=True):
+class ArmState(msgspec.Struct, frozen=True):
     """Current state of the arm."""
 
     joints: tuple[JointState, ...]
@@ -80,7 +80,7 @@ class JointsWatch:
         self._reading = ReconnectingSource(source, "the encoders", clock)
         self._opened = ExitStack()
         self._temperatures: dict[str, float | None] = dict.fromkeys(config.robot.joints)
-        self._asked, self._next_s = 0, -math.inf
+        self._queried, self._next_s = 0, -math.inf
         self._q: FloatArray | None = None
         self._low = self._high = np.zeros(len(config.robot.joints))
         self._speeds = Speeds(len(config.robot.joints))
@@ -93,7 +93,7 @@ class JointsWatch:
     def __exit__(self, *_: object) -> None:
         self._opened.close()
 
-    def look(self) -> Seen | None:
+    def look(self) -> ArmState | None:
         """Read once and return the state; None until all joints are known."""
         reading = self._reading.read(Waits.poll_s)
         if reading is not None:
@@ -102,43 +102,43 @@ class JointsWatch:
             self._q = reading.q
             self._speeds.take(reading.t, reading.q)
             self._signs.take(reading.t, reading.q)
-            self._feel_one()
+            self._read_one_temperature()
         has_all = self._servos is not None or self._speeds.are_known
-        return self._seen(self._q) if self._q is not None and has_all else None
+        return self._state(self._q) if self._q is not None and has_all else None
 
-    def look_all_over(self) -> Seen | None:
+    def look_at_all_servos(self) -> ArmState | None:
         """Call `look` until each servo was queried for its health."""
         return [self.look() for _ in self._robot.joints][-1]
 
-    def know_temperatures(self) -> None:
+    def read_temperatures(self) -> None:
         if self._servos is not None:
             for joint in self._temperatures:
                 self._temperatures[joint] = self._servos.temperature_c(joint)
 
-    def _feel_one(self) -> None:
+    def _read_one_temperature(self) -> None:
         if self._servos is None or self._clock.now() < self._next_s:
             return
-        joint = self._robot.joints[self._asked % len(self._robot.joints)]
+        joint = self._robot.joints[self._queried % len(self._robot.joints)]
         self._temperatures[joint] = self._servos.temperature_c(joint)
-        self._asked += 1
+        self._queried += 1
         self._next_s = self._clock.now() + _Settings.temperature_every_s
 
-    def _seen(self, q: FloatArray) -> Seen:
+    def _state(self, q: FloatArray) -> ArmState:
         joints = tuple(self._joint(place, float(angle)) for place, angle in enumerate(q))
-        return Seen(joints, self._signs.said, self._source.health, self._reading.trouble, self._signs_in)
+        return ArmState(joints, self._signs.prediction, self._source.health, self._reading.trouble, self._signs_in)
 
     def _joint(self, place: int, angle: float) -> JointState:
         name = self._robot.joints[place]
         servo = None if self._servos is None else self._servos.servos[place]
         sample = None if self._servos is None else self._servos.samples.get(name)
-        told = None if servo is None or sample is None else servo.direction * sample.velocity
+        reported = None if servo is None or sample is None else servo.direction * sample.velocity
         low, high = float(self._low[place]), float(self._high[place])
         lower, upper = float(self._robot.lower[place]), float(self._robot.upper[place])
         return JointState(
             joint=name,
             id=None if servo is None else servo.id,
             angle=angle,
-            velocity=float(self._speeds.v[place]) if told is None else told,
+            velocity=float(self._speeds.v[place]) if reported is None else reported,
             current=None if sample is None else sample.current,
             temperature_c=self._temperatures[name],
             low=low,
@@ -185,7 +185,7 @@ class SignCheck:
         self._robot, self._chain = robot, placed.chain
         self._begin: FloatArray | None = None
         self._rest: tuple[float, FloatArray] | None = None  # start time and position
-        self.said = ""  # the prediction in words, for the joint moved last; empty before
+        self.prediction = ""  # the prediction in words, for the joint moved last; empty before
 
     def take(self, t: float, q: FloatArray) -> None:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
@@ -196,7 +196,7 @@ class SignCheck:
         moved = q - self._begin
         place = int(np.abs(moved).argmax())
         if abs(moved[place]) > _Settings.moved_rad:
-            self.said = self._sentence(place, self._begin, float(moved[place]))
+            self.prediction = self._sentence(place, self._begin, float(moved[place]))
         if t - self._rest[0] > _Settings.still_s:  # at rest: any later motion is another move
             self._begin = q
 
@@ -204,12 +204,12 @@ class SignCheck:
         joint, turn = self._robot.joints[place], f"{math.degrees(moved):+.0f}°"
         end = begin.copy()
         end[place] += moved
-        went = self._chain.positions(end[None])[0] - self._chain.positions(begin[None])[0]
-        axis = int(np.abs(went).argmax())
-        if abs(went[axis]) < _Settings.seen_m:
-            way = "counter-clockwise" if moved > 0 else "clockwise"
-            return f"{joint} {turn}: by the URDF it turned {way}, its axis pointing at you"
-        word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]
+        displacement = self._chain.positions(end[None])[0] - self._chain.positions(begin[None])[0]
+        axis = int(np.abs(displacement).argmax())
+        if abs(displacement[axis]) < _Settings.seen_m:
+            direction = "counter-clockwise" if moved > 0 else "clockwise"
+            return f"{joint} {turn}: by the URDF it turned {direction}, its axis pointing at you"
+        word, sign = WORDS[axis][int(displacement[axis] < 0)], "+-"[int(displacement[axis] < 0)]
         parent = self._robot.camera.parent_link
         return f"{joint} {turn}: by the URDF the marker went {word} ({sign}{'xyz'[axis]} of {parent})"
 
@@ -217,7 +217,7 @@ class SignCheck:
 HINT = "Move one joint at a time. It went the other way? Correct "
 
 
-def screen(seen: Seen) -> RenderableType:
+def screen(seen: ArmState) -> RenderableType:
     """Return a row for each joint, then the joint moved last and any problems."""
     numbers = ("ID", "angle", "°/s", "mA", "°C")
     table = plain_table("joint", *numbers, "covered of the URDF's range", right=numbers)
@@ -232,7 +232,7 @@ def screen(seen: Seen) -> RenderableType:
     return Group(table, *lines)
 
 
-def as_json(seen: Seen) -> str:
+def as_json(seen: ArmState) -> str:
     """Return one line of JSON."""
     return msgspec.json.encode({"schema": 1, **msgspec.to_builtins(seen)}).decode()
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.cli.hardware.robot_template import Seen, guess_of, key_name, robot_toml
+from bodyschema.cli.hardware.robot_template import CameraFindings, guess_of, key_name, robot_toml
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import KnownModel, Servos, known_models, require_servos
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.servos import ScannedBus
-from bodyschema.interfaces.whole_files import free_backup, link_target, replace_kept, writing
+from bodyschema.interfaces.whole_files import free_backup, link_target, raising_write_errors, replace_with_backup
 from bodyschema.robot.lerobot import (
     ARMS,
     RAD_PER_TICK,
@@ -62,7 +62,9 @@ def lerobot_arm(name: str) -> LeRobotArm:
     return ARMS[name]
 
 
-def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Path, port: str, seen: Seen) -> str:
+def lerobot_robot_toml(
+    arm: LeRobotArm, urdf: Path, robot: Path, calibration: Path, port: str, seen: CameraFindings
+) -> str:
     """Return the text of a robot.toml for `arm`.
 
     Args:
@@ -86,18 +88,18 @@ def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Pa
 
 def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:
     """Return the only port that has all motors of `arm`; raise ConfigError if none or more than one has."""
-    wanted = {(arm.id(name), arm.models[name]) for name in arm.joints}
+    expected = {(arm.id(name), arm.models[name]) for name in arm.joints}
     scanned = scan([_Settings.baud])
-    found = [bus.port for bus in scanned if wanted <= {(servo.id, servo.model) for servo in bus.servos}]
+    found = [bus.port for bus in scanned if expected <= {(servo.id, servo.model) for servo in bus.servos}]
     if len(found) == 1:
         return found[0]
     if found:
         raise ConfigError(
             f"such arms are on {' and '.join(found)}", remedy="Give --port with the one to take, leader or follower"
         )
-    looked = ", ".join(f"{bus.port} has {_ids(bus)}" for bus in scanned)
+    scanned_ids = ", ".join(f"{bus.port} has {_ids(bus)}" for bus in scanned)
     raise ConfigError(
-        f"no port has servos {', '.join(f'ID {id} ({model})' for id, model in sorted(wanted))}: {looked}",
+        f"no port has servos {', '.join(f'ID {id} ({model})' for id, model in sorted(expected))}: {scanned_ids}",
         remedy="Switch the arm's supply on, or give --port",
     )
 
@@ -131,9 +133,9 @@ def _end(tree: UrdfTree, joints: Sequence[str]) -> str:
         )
     start, ends = tree.joints[joints[-1]].child, list[tuple[int, str]]()
     for link in tree.links:
-        way = tree.path(start, link)
-        if all(not upward and joint.kind not in MOVING for joint, upward in way):
-            ends.append((len(way), link))
+        joints_between = tree.path(start, link)
+        if all(not upward and joint.kind not in MOVING for joint, upward in joints_between):
+            ends.append((len(joints_between), link))
     return max(ends, key=lambda end: end[0])[1]
 
 
@@ -213,10 +215,12 @@ class CorrectedCalibration:
         after = motors | {change.motor: change.after for change in changes}
         return cls(file, after, changes, _other_zeros(config, servos, motors, file))
 
-    def already(self, recording: Path | None) -> list[str]:
+    def already_written(self, recording: Path | None) -> list[str]:
         """Return a message if the file already contains the offsets of this recording, otherwise nothing."""
         digest = _digest(recording)
-        backups = [line.split("\t")[1] for line in self._noted().splitlines() if line.startswith(f"{digest}\t")]
+        backups = [
+            line.split("\t")[1] for line in self._noted_recordings().splitlines() if line.startswith(f"{digest}\t")
+        ]
         if recording is None or not backups:
             return []
         target = link_target(self.file)
@@ -235,15 +239,15 @@ class CorrectedCalibration:
         Raises:
             ConfigError: nothing could be written.
         """
-        beside = dict[str, bytes]()
+        extra_files = dict[str, bytes]()
         if recording is not None and (digest := _digest(recording)):
             backup = free_backup(link_target(self.file))
             noted = f"{digest}\t{backup.name}\t{recording.name}\n"
-            beside[RECORDINGS] = (self._noted() + noted).encode(errors="surrogateescape")
-        with writing(self.file):
-            return replace_kept(self.file, calibration_json(self.motors).encode(), beside)
+            extra_files[RECORDINGS] = (self._noted_recordings() + noted).encode(errors="surrogateescape")
+        with raising_write_errors(self.file):
+            return replace_with_backup(self.file, calibration_json(self.motors).encode(), extra_files)
 
-    def _noted(self) -> str:
+    def _noted_recordings(self) -> str:
         """Return a line for each recording whose offsets are in the file: digest, name of the old file, recording."""
         target = link_target(self.file)
         try:

@@ -24,7 +24,7 @@ class Guess(NamedTuple):
     camera_link: str
 
 
-class Seen(NamedTuple):
+class CameraFindings(NamedTuple):
     """Cameras of the robot and their marker."""
 
     cameras: Sequence[str] = ()  # those that are plugged in; with two or more, the first two are the eyes
@@ -43,7 +43,7 @@ class Seen(NamedTuple):
         return _BALL.format(radius_m=_metres((self.ball_mm or 40.0) / 2))
 
 
-_NOTHING_SEEN = Seen()
+_NOTHING_SEEN = CameraFindings()
 _FINGER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 EXAMPLE = Guess("my_robot", "my_robot.urdf", ["joint_1", "joint_2"], "hand", "base_link")
 
@@ -162,7 +162,7 @@ device = {device}
 _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-video-index0"
 
 
-def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
+def robot_toml(guess: Guess, seen: CameraFindings = _NOTHING_SEEN) -> str:
     """Return the text of a commented robot.toml."""
     return _TEMPLATE.format(
         name=toml_value(guess.name),
@@ -181,7 +181,7 @@ def _metres(length_mm: float) -> str:
     return f"{1e-3 * length_mm:.6g}"
 
 
-def _camera_tables(seen: Seen) -> str:
+def _camera_tables(seen: CameraFindings) -> str:
     """Return the cameras' tables; with fewer than two cameras, an example that is commented out."""
     if seen.webcam is not None:
         return _CAMERAS.format(hidden="", devices=_ONE.format(device=toml_value(seen.webcam)))

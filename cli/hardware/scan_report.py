@@ -68,8 +68,8 @@ def report_of(ports: Sequence[ScannedBus], config: Config | None) -> ScanReport:
     joints: list[JointFinding] = []
     for entry in servos.servos:
         bus = servos.bus_of(entry)
-        wanted = servos.buses[bus]
-        state, fix, servo = _place(found, entry.id, entry.model, wanted.port, wanted.baud)
+        configured = servos.buses[bus]
+        state, fix, servo = _place(found, entry.id, entry.model, configured.port, configured.baud)
         joints.append(JointFinding(entry.joint, bus, entry.id, entry.model, state, fix, servo))
     known = {id(joint.servo) for joint in joints}
     own = {os.path.realpath(bus.port) for bus in servos.buses.values()}

@@ -18,7 +18,7 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
 from bodyschema.interfaces.waits import Waits
-from bodyschema.interfaces.whole_files import write_whole, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, write_atomically
 from bodyschema.robot.limited import read_at_most
 
 LIMIT_S = 30.0  # without a fix
@@ -34,7 +34,7 @@ class Collected:
     health: tuple[str, ...] = ()  # faults of the cameras with their remedies
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         """Message on missed images if at least one in five gave no fix, otherwise empty."""
         fixes, missed = len(self.wiggle.t_marker), self.missed.total()
         if missed < 0.2 * (fixes + missed):
@@ -142,8 +142,8 @@ def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
     writer = csv.writer(text)
     writer.writerow(["t", *joints, *POSITION])
     writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
-    with writing(file, RecordingError):
-        write_whole({file: text.getvalue().encode()})
+    with raising_write_errors(file, RecordingError):
+        write_atomically({file: text.getvalue().encode()})
 
 
 def read_wiggle(file: Path, joints: Sequence[str]) -> Wiggle:

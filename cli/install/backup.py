@@ -215,8 +215,8 @@ class Backup:
             )
         if {STORE, ROBOT_TOML} - manifest.files.keys() or sizes.keys() != manifest.files.keys():
             raise BackupError(f"{self.file} does not hold the files that its {MANIFEST} says")
-        told = (manifest.written_utc, manifest.version, *(entry.origin for entry in manifest.files.values()))
-        if not all(text.isprintable() for text in told):
+        texts = (manifest.written_utc, manifest.version, *(entry.origin for entry in manifest.files.values()))
+        if not all(text.isprintable() for text in texts):
             raise BackupError(f"the {MANIFEST} of {self.file} has characters that cannot be shown")
         for name, entry in manifest.files.items():
             with archive.open(name) as stream:

@@ -102,22 +102,26 @@ def _tables(backup: Backup) -> dict[str, Any]:
 def _targets(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> dict[str, Path]:
     """Return the targets of the description's files; robot.toml may have another name here."""
     allowed = {ROBOT_TOML, *description_files(tables)}
-    given = backup.manifest.files.keys() - {STORE, CHECKPOINT}
-    if given != allowed:
-        odd = sorted(given - allowed)
-        what = f"has {odd[0]!r}, which its robot.toml does not name so" if odd else "lacks a file that robot.toml names"
+    backed_up = backup.manifest.files.keys() - {STORE, CHECKPOINT}
+    if backed_up != allowed:
+        unexpected = sorted(backed_up - allowed)
+        what = (
+            f"has {unexpected[0]!r}, which its robot.toml does not name so"
+            if unexpected
+            else "lacks a file that robot.toml names"
+        )
         raise BackupError(f"{backup.file} {what}. {NOTHING_CHANGED}")
-    inside = {name: name.removeprefix(f"{ROBOT}/") for name in given}
+    inside = {name: name.removeprefix(f"{ROBOT}/") for name in backed_up}
     return {name: robot_file if name == ROBOT_TOML else robot_file.parent / path for name, path in inside.items()}
 
 
 def _state_dir(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> Path:
     daemon = tables.get("daemon")
-    given = daemon.get("state_dir") if isinstance(daemon, dict) else None
-    if not isinstance(given, str):
+    configured = daemon.get("state_dir") if isinstance(daemon, dict) else None
+    if not isinstance(configured, str):
         return state_home() / backup.manifest.robot
     home = robot_file.parent.resolve()
-    folder = (home / given).resolve()
+    folder = (home / configured).resolve()
     seen = folder.is_relative_to(home) and not any(part.startswith(".") for part in folder.relative_to(home).parts)
     if not (seen or backup.has(ROBOT_TOML, robot_file)):
         where = "in a hidden folder" if folder.is_relative_to(home) else "outside of its folder"
@@ -129,19 +133,19 @@ def _state_dir(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> P
 
 
 def _require_room(backup: Backup, targets: Iterable[Path], *, force: bool) -> None:
-    there = [str(target) for target in targets if target.exists()]
-    if there and not force:
+    existing = [str(target) for target in targets if target.exists()]
+    if existing and not force:
         raise BackupError(
-            f"{', '.join(there)}: there already, and not what {backup.file} has. {NOTHING_CHANGED}. Give --force, "
+            f"{', '.join(existing)}: there already, and not what {backup.file} has. {NOTHING_CHANGED}. Give --force, "
             "which moves what is there aside, or another --robot or --state-dir"
         )
 
 
 def _require_at_rest(backup: Backup, tables: Mapping[str, Any]) -> None:
     zenoh, robot = tables.get("zenoh"), backup.manifest.robot
-    given = {key: zenoh[key] for key in ("sampler", "learner") if key in zenoh} if isinstance(zenoh, dict) else {}
+    addresses = {key: zenoh[key] for key in ("sampler", "learner") if key in zenoh} if isinstance(zenoh, dict) else {}
     try:
-        endpoints = convert(given, ZenohConfig, file=backup.file, text="", prefix=("zenoh",))
+        endpoints = convert(addresses, ZenohConfig, file=backup.file, text="", prefix=("zenoh",))
     except ConfigError as error:
         raise BackupError(f"the robot.toml in {error}. {NOTHING_CHANGED}") from error
     for process in ("sampler", "learner"):

@@ -120,7 +120,7 @@ def run_router(config: RouterConfig, stopping: Callable[[], bool], notifier: Not
         log.info("the router takes connections on %s; it has roles for: %s", config.tables.listen, robots)
         service = Service(notifier, (PASSING_ON,), clock)
         service.ready()
-        service.tell(f"takes connections on {config.tables.listen}")
+        service.report_status(f"takes connections on {config.tables.listen}")
         while not stopping():
             service.beat(PASSING_ON)
             time.sleep(Waits.poll_s)

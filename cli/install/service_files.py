@@ -152,10 +152,10 @@ def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) 
         folder = root / os.path.abspath(config.state_dir).lstrip("/")
         if config.tables.daemon.state_dir is None or folder.exists():
             continue
-        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        created = [path for path in (folder, *folder.parents) if not path.exists()]
         with writing(folder, "install service"):
             folder.mkdir(0o750, parents=True)
-            for path in made if os.geteuid() == 0 else ():
+            for path in created if os.geteuid() == 0 else ():
                 shutil.chown(path, user)
 
 
@@ -180,6 +180,6 @@ def systemd_version() -> int:
     """Return this machine's systemd version, or the oldest that the units support."""
     if shutil.which("systemctl") is None:
         return OLDEST_SYSTEMD
-    said = subprocess.run(["systemctl", "--version"], capture_output=True, text=True, check=False, timeout=10).stdout
-    found = re.match(r"systemd (\d+)", said)
+    output = subprocess.run(["systemctl", "--version"], capture_output=True, text=True, check=False, timeout=10).stdout
+    found = re.match(r"systemd (\d+)", output)
     return OLDEST_SYSTEMD if found is None else int(found[1])

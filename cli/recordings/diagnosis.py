@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+from bodyschema.calibration.plausibility.check import plausibility, recorded_sigma
 from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.daemon.config import Config
@@ -21,7 +21,7 @@ from bodyschema.daemon.transport.session import client
 from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
-from bodyschema.diagnosis.fit.observations import ticks
+from bodyschema.diagnosis.fit.observations import encoder_steps
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.report.result import DiagnosisFile
@@ -31,7 +31,7 @@ from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
 from bodyschema.effects.effect_type import CameraEffect
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.interfaces.whole_files import write_whole, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, write_atomically
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.recording import Recording
@@ -51,7 +51,7 @@ class DiagnosisError(BodyschemaError):
 
 
 @dataclass(frozen=True)
-class Asked:
+class DiagnosisSettings:
     """Settings of a diagnosis."""
 
     # only, without: names of effects; all when `only` is empty
@@ -60,12 +60,12 @@ class Asked:
     seed: int  # of the resampling
 
     @classmethod
-    def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
+    def of(cls, only: str | None, without: str | None, seed: int) -> DiagnosisSettings:
         """Parse comma-separated names; raise RequestError if an effect is unknown, or none remains."""
-        asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
-        if set(asked.only or EFFECT_TYPES) <= set(asked.without):
+        settings = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
+        if set(settings.only or EFFECT_TYPES) <= set(settings.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
-        return asked
+        return settings
 
 
 def _names(text: str | None, option: str) -> tuple[str, ...]:
@@ -142,11 +142,11 @@ class ReportedDiagnosis:
     def json(self) -> str:
         """diagnosis.json, with the camera's pose in addition to the findings, and the covariance of predicted poses."""
         covariance = predicted_pose_covariance(self.diagnosis.stored)
-        told = msgspec.to_builtins(self.file, enc_hook=float) | {
+        contents = msgspec.to_builtins(self.file, enc_hook=float) | {
             "hand_eye": msgspec.to_builtins(self.hand_eye),
             POSE_COVARIANCE: None if covariance is None else covariance.ravel().tolist(),
         }
-        return msgspec.json.format(msgspec.json.encode(told), indent=1).decode()
+        return msgspec.json.format(msgspec.json.encode(contents), indent=1).decode()
 
     @property
     def hand_eye(self) -> HandEye:
@@ -176,10 +176,12 @@ class ReportedDiagnosis:
     def remedies(self) -> list[str]:
         run = self.diagnosis.extended.run
         torques = np.abs(run.torques).max(axis=0)
-        return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)
+        return remedies(self.file, self.robot, encoder_steps(self.source.recording.q), torques)
 
 
-def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool = False) -> ReportedDiagnosis:
+def run(
+    config: Config, source: Source, settings: DiagnosisSettings, tell: Tell, *, force: bool = False
+) -> ReportedDiagnosis:
     """Diagnose.
 
     Args:
@@ -190,28 +192,28 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
         RecordingError: the pairs cannot be of this robot in their present form.
     """
     robot, recording = config.robot, source.recording
-    fewest = 5 * len(robot.joints)
-    if len(recording) < fewest:
+    min_pairs = 5 * len(robot.joints)
+    if len(recording) < min_pairs:
         raise DiagnosisError(
             f"{source.name}: {len(recording)} pairs are too few to tell causes of {len(robot.joints)} joints apart. "
-            f"Record at least {fewest}; some hundred are better"
+            f"Record at least {min_pairs}; some hundred are better"
         )
     if np.ptp(recording.q, axis=0).max() < HypothesisSettings.still:
         raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
     tell(f"{len(recording)} pairs of {source.name}")
     chain = NominalModel.extended_by(config.simulation).chain
-    seen = plausibility(
+    plausible = plausibility(
         robot,
         recording.q,
         recording.x,
         t=recording.t,
         chain=chain,
-        sigma_m=told_sigma(recording),
+        sigma_m=recorded_sigma(recording),
         orientation=recording.orientation,
     )
-    warnings = seen.require(source.name, force=force)
+    warnings = plausible.require(source.name, force=force)
     diagnosis = diagnosed(
-        recording, config.simulation, only=asked.only, without=asked.without, seed=asked.seed, tell=tell
+        recording, config.simulation, only=settings.only, without=settings.without, seed=settings.seed, tell=tell
     )
     if not diagnosis.hypotheses.effects:
         raise DiagnosisError(
@@ -243,7 +245,7 @@ def results_in(folder: Path | None) -> Iterator[None]:
 
 def require_writable(folder: Path) -> None:
     """Create the folder; raise RecordingError if nothing can be written to it."""
-    with writing(folder, RecordingError, remedy="Give another folder"):
+    with raising_write_errors(folder, RecordingError, remedy="Give another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -254,12 +256,14 @@ def written(found: ReportedDiagnosis, folder: Path) -> None:
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
     extended = found.diagnosis.stored.written
-    told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
-    write_extended(extended, folder, told, replace=True)
+    description = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
+    write_extended(extended, folder, description, replace=True)
     # Tolerances alone are put into a URDF only if the recording determines them.
-    bare = extended if found.diagnosis.tolerated.seen[:2].any() else extended.with_background(())
-    write_corrected(bare, folder, heading)
-    with writing(folder, RecordingError):
+    with_tolerances = (
+        extended if found.diagnosis.estimated_tolerances.is_detected[:2].any() else extended.with_background(())
+    )
+    write_corrected(with_tolerances, folder, heading)
+    with raising_write_errors(folder, RecordingError):
         folder.mkdir(parents=True, exist_ok=True)
         report = page(found.diagnosis, found.file, found.remedies, about)
-        write_whole({folder / DIAGNOSIS: f"{found.json}\n".encode(), folder / REPORT: report.encode()})
+        write_atomically({folder / DIAGNOSIS: f"{found.json}\n".encode(), folder / REPORT: report.encode()})

@@ -180,5 +180,5 @@ def _units(config: Config, source: Path, lerobot: Path | None, unit: Unit | None
             remedy=f"Give --lerobot CALIBRATION.json. {where_calibrations_are()}",
         )
     servos = {servo.joint: servo for servo in joint_servos(require_servos(config))}
-    wanted = [servos[joint] for joint in config.robot.joints]
-    return LeRobotUnits(read_calibration(lerobot, config.robot.joints), wanted, unit)
+    configured = [servos[joint] for joint in config.robot.joints]
+    return LeRobotUnits(read_calibration(lerobot, config.robot.joints), configured, unit)

@@ -14,7 +14,7 @@ from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.wire import PairsReply, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import Pair
-from bodyschema.interfaces.whole_files import writing
+from bodyschema.interfaces.whole_files import raising_write_errors
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.csv_file import write_csv_rows
 from bodyschema.recordings.parquet_file import INTEGER_COLUMNS
@@ -104,7 +104,7 @@ def follow_history(history: History, robot: RobotDescription, out: Path, stopped
         if pairs:
             _write(recordings.from_pairs(pairs, robot.joints), out, robot)
         return len(pairs)
-    with writing(out, RecordingError), out.open("w", encoding="utf-8", newline="\n") as stream:
+    with raising_write_errors(out, RecordingError), out.open("w", encoding="utf-8", newline="\n") as stream:
         rows = _CsvRows(stream, robot.joints)
         _follow(history, stopped, rows.add)
     if not rows.count:

@@ -57,13 +57,13 @@ def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: n
 
 def without_consequence(simulation: Simulation, like: Recording | None = None) -> list[str]:
     """Return sentences on the effects that have no influence for this robot or for a recording without times."""
-    said = []
+    sentences = []
     for name in dict.fromkeys(effect.name for effect in simulation.effects):
         if EFFECT_TYPES[name].needs_times and like is not None and like.t is None:
-            said.append(f"{name} changes nothing: the recording has no column t")
+            sentences.append(f"{name} changes nothing: the recording has no column t")
         if EFFECT_TYPES[name].needs_weight and not simulation.bears_weight:
-            said.append(f'{name} changes nothing: with hold = "torque_free" the guiding hand bears the weight')
-    return said
+            sentences.append(f'{name} changes nothing: with hold = "torque_free" the guiding hand bears the weight')
+    return sentences
 
 
 def _seen_again(calibration: StereoCalibration, x: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -12,7 +12,7 @@ from bodyschema.calibration.evaluate import BLOCKS, ErrorFigures
 from bodyschema.cli.terminal.findings_view import outlook_sentence
 from bodyschema.cli.terminal.screen import mm
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.status import Outlook
+from bodyschema.learning.status import DataOutlook
 
 
 class Figures(msgspec.Struct, frozen=True):
@@ -70,7 +70,7 @@ class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
     within_sigma_share: float  # share of held-out coordinates within 1-sigma of prediction and stated noise together
     doubted: int
     replayed: int  # replay steps of the instant learner
-    outlook: Outlook | None  # gain that the learner expects of further pairs, or null
+    outlook: DataOutlook | None  # gain that the learner expects of further pairs, or null
     doubt: str | None  # possible problems of the recording, or null: columns read wrongly, another robot
     learning_s: float  # time from the first pair to the end of learning [s]
     angle: AngleFigures | None = None  # of the marker's orientation; null if the recording has none

@@ -200,14 +200,14 @@ class _Live:
             state = sampler.frames, learner.pairs, learner.replayed, learner.model, learner.outlook
             if state != last:
                 last, changed = state, now
-            through = sampler.state == "ended"
-            if through and not sampler.pairs:
+            has_ended = sampler.state == "ended"
+            if has_ended and not sampler.pairs:
                 raise RecordingError(
                     f"the sampler accepted none of the rows: {_reasons_text(sampler.rejected)}",
                     file=self._recording.file or "recording",
                     remedy="--any-step relaxes its step and speed rules",
                 )
-            if through and learner.pairs + learner.refused >= sampler.pairs and learner.at_rest:
+            if has_ended and learner.pairs + learner.refused >= sampler.pairs and learner.at_rest:
                 return sampler, learner, changed - begin
             if now - changed > self._stall_limit_s:
                 raise BusError(f"no progress for {self._stall_limit_s:.0f} s; --keep DIR keeps the logs that say why")

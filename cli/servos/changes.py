@@ -19,12 +19,12 @@ from bodyschema.daemon.wiring.eeprom import (
     HOMING_OFFSET,
     ID,
     Change,
-    Done,
     EepromEditor,
     IdentifiedServo,
     Outcome,
+    SelectedServo,
     Setting,
-    Wanted,
+    WriteResult,
     entry_of,
     model_called,
     setting_called,
@@ -41,12 +41,12 @@ POSITION_MODE, IGNORED_BEYOND = 3, 1024  # Dynamixel servos ignore a larger homi
 class Planned:
     """A planned change, and the location of its servo."""
 
-    wanted: Wanted
+    selected: SelectedServo
     change: Change
 
     @property
     def is_needed(self) -> bool:
-        return self.change.now != self.change.then
+        return self.change.now != self.change.target
 
 
 def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
@@ -66,33 +66,35 @@ def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
     return found
 
 
-def plan(workbench: EepromEditor, wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]]) -> list[Planned]:
+def plan(
+    workbench: EepromEditor, selected: Sequence[SelectedServo], assigned: Sequence[tuple[str, str]]
+) -> list[Planned]:
     """Plan the writes. Queries the servos, and writes nothing.
 
     Raises:
         ConfigError: a model lacks a setting, a value is out of range, or an ID is taken.
         SourceError: a servo does not answer, or is another model.
     """
-    if any(name == ID for name, _ in wishes) and len(wanted) > 1:
+    if any(name == ID for name, _ in assigned) and len(selected) > 1:
         raise ConfigError("several servos cannot get one ID", remedy="Name one, with --joint or --id")
     planned: list[Planned] = []
-    for one in wanted:
+    for one in selected:
         known = settings_by_name(workbench, one.model)
-        values = [(setting_called(name, known, one.model.name), text) for name, text in wishes]
+        values = [(setting_called(name, known, one.model.name), text) for name, text in assigned]
         numbers = [(setting, setting.value(text)) for setting, text in values]
         bus = workbench.bus(one.port, one.baud)
-        servo = workbench.fitted(bus, one.entry, one.model)
-        for setting, then in numbers:
-            change = Change(servo, setting, workbench.value(bus, servo, setting), then)
-            if setting.name == ID and then != change.now and workbench.is_taken(bus, then):
+        servo = workbench.identified_servo(bus, one.entry, one.model)
+        for setting, target in numbers:
+            change = Change(servo, setting, workbench.value(bus, servo, setting), target)
+            if setting.name == ID and target != change.now and workbench.is_taken(bus, target):
                 raise ConfigError(
-                    f"the ID {then} is taken on {one.port}", remedy="`bodyschema scan` shows who is there"
+                    f"the ID {target} is taken on {one.port}", remedy="`bodyschema scan` shows who is there"
                 )
             planned.append(Planned(one, change))
     return planned
 
 
-def plan_zeros(workbench: EepromEditor, wanted: Sequence[Wanted]) -> list[Planned]:
+def plan_zeros(workbench: EepromEditor, selected: Sequence[SelectedServo]) -> list[Planned]:
     """Plan homing offsets that set the joints to 0 at their present positions; writes nothing.
 
     Raises:
@@ -100,43 +102,43 @@ def plan_zeros(workbench: EepromEditor, wanted: Sequence[Wanted]) -> list[Planne
         SourceError: a servo does not answer, or is another model.
     """
     planned = []
-    for one in wanted:
+    for one in selected:
         known = settings_by_name(workbench, one.model)
         setting = setting_called(HOMING_OFFSET, known, one.model.name)
         bus = workbench.bus(one.port, one.baud)
-        servo = workbench.fitted(bus, one.entry, one.model)
-        then = workbench.homing_offset(bus, servo)
-        _require_heeded(one, servo, setting, then)
-        planned.append(Planned(one, Change(servo, setting, servo.homing_offset, then)))
+        servo = workbench.identified_servo(bus, one.entry, one.model)
+        target = workbench.homing_offset(bus, servo)
+        _require_effective(one, servo, setting, target)
+        planned.append(Planned(one, Change(servo, setting, servo.homing_offset, target)))
     return planned
 
 
-def _require_heeded(wanted: Wanted, servo: IdentifiedServo, setting: Setting, then: int) -> None:
+def _require_effective(selected: SelectedServo, servo: IdentifiedServo, setting: Setting, target: int) -> None:
     """Raise ConfigError if the servo would ignore such an offset, or cannot store it."""
-    gentle = "`bodyschema servos --zero` without --in-servo prints zero_ticks for robot.toml, which serve as well"
-    what = f"joint {servo.joint!r} would need the homing offset {setting.shown(then)}"
-    if not setting.lowest <= then <= setting.highest:
-        raise ConfigError(f"{what}, which is out of range", remedy=gentle)
-    is_near = wanted.table != "dynamixel" or wanted.model.series == "P" or abs(then) <= IGNORED_BEYOND
+    alternative = "`bodyschema servos --zero` without --in-servo prints zero_ticks for robot.toml, which serve as well"
+    what = f"joint {servo.joint!r} would need the homing offset {setting.shown(target)}"
+    if not setting.lowest <= target <= setting.highest:
+        raise ConfigError(f"{what}, which is out of range", remedy=alternative)
+    is_near = selected.table != "dynamixel" or selected.model.series == "P" or abs(target) <= IGNORED_BEYOND
     if not is_near and servo.operating_mode == POSITION_MODE:
         raise ConfigError(
-            f"{what}, which it ignores in position mode", remedy=f"{gentle}. Or set operating_mode=extended"
+            f"{what}, which it ignores in position mode", remedy=f"{alternative}. Or set operating_mode=extended"
         )
 
 
-def zero_ticks(workbench: EepromEditor, wanted: Sequence[Wanted]) -> list[tuple[IdentifiedServo, int]]:
+def zero_ticks(workbench: EepromEditor, selected: Sequence[SelectedServo]) -> list[tuple[IdentifiedServo, int]]:
     """Return each servo's present position: the zero_ticks that put its joint at 0 there. Writes nothing."""
     found = []
-    for one in wanted:
+    for one in selected:
         bus = workbench.bus(one.port, one.baud)
-        servo = workbench.fitted(bus, one.entry, one.model)
+        servo = workbench.identified_servo(bus, one.entry, one.model)
         found.append((servo, workbench.position(bus, servo)))
     return found
 
 
 def carry_out(
     workbench: EepromEditor, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
-) -> list[Done]:
+) -> list[WriteResult]:
     """Switch torque off and verify it, then write the changes; log each write before sending it to the servo.
 
     Raises:
@@ -145,30 +147,30 @@ def carry_out(
     """
     needed = [each for each in planned if each.is_needed]
     for each in needed:
-        workbench.torque_off(workbench.bus(each.wanted.port, each.wanted.baud), [each.change.servo])
+        workbench.torque_off(workbench.bus(each.selected.port, each.selected.baud), [each.change.servo])
     batch = max(log.batches(), default=0) + 1
     entries = {id(each.change): _entry(each, batch, clock.utc(), undoes) for each in needed}
-    done: list[Done] = []
-    for _, together in groupby(needed, key=lambda each: (each.wanted.port, each.change.setting.name)):
+    done: list[WriteResult] = []
+    for _, together in groupby(needed, key=lambda each: (each.selected.port, each.change.setting.name)):
         group = list(together)
         log.append([entries[id(each.change)] for each in group])
-        came = _written(workbench, group)
-        log.append([msgspec.structs.replace(entries[id(one.change)], state=one.outcome.value) for one in came])
-        done += came
+        results = _written(workbench, group)
+        log.append([msgspec.structs.replace(entries[id(one.change)], state=one.outcome.value) for one in results])
+        done += results
     return done
 
 
-def _written(workbench: EepromEditor, group: Sequence[Planned]) -> list[Done]:
+def _written(workbench: EepromEditor, group: Sequence[Planned]) -> list[WriteResult]:
     """Write all planned values of one setting on one port; with baud rates, write all before querying any servo."""
     first = group[0]
     if first.change.setting.name != BAUD:
-        bus = workbench.bus(first.wanted.port, first.wanted.baud)
+        bus = workbench.bus(first.selected.port, first.selected.baud)
         return [workbench.write(bus, each.change) for each in group]
-    done: list[Done] = []
-    for then in dict.fromkeys(each.change.then for each in group):
-        changes = [each.change for each in group if each.change.then == then]
-        rate = rate_of(first.change.setting, then)
-        done += workbench.write_bauds(first.wanted.port, first.wanted.baud, rate, changes)
+    done: list[WriteResult] = []
+    for target in dict.fromkeys(each.change.target for each in group):
+        changes = [each.change for each in group if each.change.target == target]
+        rate = rate_of(first.change.setting, target)
+        done += workbench.write_bauds(first.selected.port, first.selected.baud, rate, changes)
     return done
 
 
@@ -189,40 +191,40 @@ def plan_undo(workbench: EepromEditor, entries: Sequence[LoggedWrite]) -> tuple[
             baud=rate_of(setting, entry.new) if entry.name == BAUD else entry.baud,
         )
         try:
-            wanted = Wanted(entry.table, place.port, place.baud, entry_of(entry.joint, place.id, model), model)
-            bus = workbench.bus(wanted.port, wanted.baud)
-            servo = workbench.fitted(bus, wanted.entry, model)
+            selected = SelectedServo(entry.table, place.port, place.baud, entry_of(entry.joint, place.id, model), model)
+            bus = workbench.bus(selected.port, selected.baud)
+            servo = workbench.identified_servo(bus, selected.entry, model)
             now = workbench.value(bus, servo, setting)
         except BodyschemaError as error:
             left.append(str(error))
             continue
         if now == entry.new:
-            planned.append(Planned(wanted, Change(servo, setting, now, entry.old)))
+            planned.append(Planned(selected, Change(servo, setting, now, entry.old)))
         else:
             left.append(f"{entry.joint} (ID {entry.id}): {entry.name} is {setting.shown(now)}, which we did not write")
     return planned, left
 
 
-def is_well(done: Sequence[Done]) -> bool:
+def is_well(done: Sequence[WriteResult]) -> bool:
     """Return True if everything was written without remarks."""
-    return all(one.outcome is Outcome.WRITTEN and not one.said for one in done)
+    return all(one.outcome is Outcome.WRITTEN and not one.remarks for one in done)
 
 
 def _entry(planned: Planned, batch: int, utc: str, undoes: int | None) -> LoggedWrite:
-    wanted, change = planned.wanted, planned.change
+    selected, change = planned.selected, planned.change
     return LoggedWrite(
         utc=utc,
         batch=batch,
-        table=wanted.table,
-        port=wanted.port,
-        baud=wanted.baud,
+        table=selected.table,
+        port=selected.port,
+        baud=selected.baud,
         id=change.servo.id,
-        model=wanted.model.name,
+        model=selected.model.name,
         joint=change.servo.joint,
         name=change.setting.name,
         address=change.setting.register.address,
         old=change.now,
-        new=change.then,
+        new=change.target,
         undoes=undoes,
     )
 
@@ -236,26 +238,26 @@ def planned_table(planned: Sequence[Planned]) -> RenderableType:
     for each in planned:
         change = each.change
         arrow, style = ("→", "bold") if each.is_needed else ("=", "dim")
-        then = Text(change.setting.shown(change.then), style=style)
-        table.add_row(*_who(change), change.setting.shown(change.now), arrow, then)
+        target = Text(change.setting.shown(change.target), style=style)
+        table.add_row(*_who(change), change.setting.shown(change.now), arrow, target)
     follows = {each.change.setting.name: each.change.setting.follows for each in planned if each.is_needed}
     lines = [Text(f"{name}: {what}", style="yellow") for name, what in follows.items() if what]
     return Group(table, *lines)
 
 
-def done_table(done: Sequence[Done]) -> RenderableType:
+def done_table(done: Sequence[WriteResult]) -> RenderableType:
     """Return a table of the result of each write."""
     table = plain_table("joint", "ID", "register", "before", "", "now", right=("ID",))
-    said: list[Text] = []
+    remarks: list[Text] = []
     for one in done:
         change, found = one.change, one.found
         is_written = one.outcome is Outcome.WRITTEN
         now = "?" if found is None else change.setting.shown(found)
         colour = "green" if is_written else "red"
         table.add_row(*_who(change), change.setting.shown(change.now), "→", Text(f"{now}  {one.outcome}", style=colour))
-        if one.said:
-            said.append(Text(f"{change.servo.joint} (ID {change.servo.id}): {one.said}", style="yellow"))
-    return Group(table, *said)
+        if one.remarks:
+            remarks.append(Text(f"{change.servo.joint} (ID {change.servo.id}): {one.remarks}", style="yellow"))
+    return Group(table, *remarks)
 
 
 def settings_table(servo: IdentifiedServo, values: Sequence[tuple[Setting, int]]) -> RenderableType:

@@ -33,37 +33,37 @@ def view(report: CalibrationReport) -> Group:
 
 
 def sentences(report: CalibrationReport) -> list[str]:
-    said = [_expected(report)] if report.expected_mm is not None else []
-    said += [
+    lines = [_expected(report)] if report.expected_mm is not None else []
+    lines += [
         f"Mean distance to the pairs: {_distances(report)}. {_noise(report)} {_outliers(report)}",
         _workmanship(report),
     ]
     if report.trusted == "nothing":
-        said.append(f"{report.shown} of {report.showable} identifiable parameters were determined." + _advice(report))
+        lines.append(f"{report.shown} of {report.showable} identifiable parameters were determined." + _advice(report))
     hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
     if hidden and report.trusted != "urdf":
-        said.append(
+        lines.append(
             f"Kept at nominal: {', '.join(hidden)}. The measurements cannot separate {such_zeros(hidden)} from a "
             "rotation of the camera, the marker or a neighbouring joint. Predicted positions are unaffected. "
             "The other figures are given that."
         )
     if report.undirected:
-        said.append(
+        lines.append(
             f"These pairs do not show which way {', '.join(report.undirected)} "
             f"count{'s' if len(report.undirected) == 1 else ''}: the positions are the same either way."
         )
     if report.first > 1:
-        said.insert(0, f"Learnt from row {report.first} on.")
+        lines.insert(0, f"Learnt from row {report.first} on.")
     if report.other_tool_from is not None:
-        said.insert(0, two_tools(report))
+        lines.insert(0, two_tools(report))
     if report.misfit > _Settings.misfit:
-        said.append(
+        lines.append(
             f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
             "(compliance, eccentric encoders), or the noise is larger than stated. The intervals are widened."
         )
     if report.doubt is not None:
-        said.insert(0, report.doubt)
-    return said
+        lines.insert(0, report.doubt)
+    return lines
 
 
 def two_tools(report: CalibrationReport) -> str:
@@ -102,11 +102,11 @@ def _expected(report: CalibrationReport) -> str:
 
 def _trusted(report: CalibrationReport) -> str:
     what = "Links and zeros are" if report.trusted == "urdf" else "The links are"
-    said = f"{what} those of the URDF; the intervals hold if it is right."
+    lines = f"{what} those of the URDF; the intervals hold if it is right."
     free, expected = report.free_expected_mm, report.expected_mm
     if free is None or expected is None or expected < _Settings.wrong_urdf * free:
-        return said
-    return f"{said} The recording says it is not: with nothing held, expect {free:.2g} mm on new poses."
+        return lines
+    return f"{lines} The recording says it is not: with nothing held, expect {free:.2g} mm on new poses."
 
 
 def _workmanship(report: CalibrationReport) -> str:

@@ -11,10 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.terminal.screen import ScreenSettings
-from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, telling
+from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, significant_numbers
 from bodyschema.diagnosis.report.presenters.registry import named, rival_named
 from bodyschema.diagnosis.report.result import DiagnosisFile, Indistinguishable, ResultSettings, Verdict
-from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do
+from bodyschema.diagnosis.report.text import actions, in_order, modelled, other_shares, tolerance_sentence
 
 _HEADS: dict[Verdict, tuple[str, str]] = {
     "explained": ("EXPLAINED", "bold white on dark_green"),
@@ -58,12 +58,12 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
     if diagnosis.causes:
         parts.append(_causes(diagnosis, timed))
     if diagnosis.tolerances is not None:
-        parts.append(Text(made_to(diagnosis.tolerances, diagnosis.seen_by)))
+        parts.append(Text(tolerance_sentence(diagnosis.tolerances, diagnosis.seen_by)))
     if rivals := _rivals(diagnosis):
         parts.append(_list("Not distinguished", rivals))
     if diagnosis.rejected:
         parts.append(_rejected(diagnosis))
-    first, small = to_do(diagnosis, remedies)
+    first, small = actions(diagnosis, remedies)
     if first:
         parts.append(_list("What to do", first, numbered=True))
     if small:
@@ -87,9 +87,9 @@ def unexplained(diagnosis: DiagnosisFile) -> str:
 
 def _rivals(diagnosis: DiagnosisFile) -> list[str]:
     """Return one sentence for each alternative explanation of a cause."""
-    told, by = [cause for cause in diagnosis.causes if not cause.is_correction], diagnosis.seen_by
-    names = [named(cause.effect, cause.where, cause.source, by) for cause in told]
-    pairs = zip(names, told, strict=True)
+    causes, by = [cause for cause in diagnosis.causes if not cause.is_correction], diagnosis.seen_by
+    names = [named(cause.effect, cause.where, cause.source, by) for cause in causes]
+    pairs = zip(names, causes, strict=True)
     return list(dict.fromkeys(_rival(name, rival, by) for name, cause in pairs for rival in cause.rivals))
 
 
@@ -139,12 +139,12 @@ def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:
     for cause in in_order(diagnosis.causes):
         if cause.is_correction:
             break
-        numbers = telling(numbers_of(cause, timed=timed))
+        numbers = significant_numbers(numbers_of(cause, timed=timed))
         figures = (percent(cause.probability), share(cause.share_of_gain_percent), share(cause.held_out_gain_percent))
         labels, values = ("\n".join(lines) for lines in ([n.label for n in numbers], [str(n) for n in numbers]))
         table.add_row(Text(place(cause).replace(" ", "\n", 1)), labels, values, *figures)
-    for told, of in other_shares(diagnosis):
-        table.add_row(told, "", "", "", share(of), "")
+    for label, part in other_shares(diagnosis):
+        table.add_row(label, "", "", "", share(part), "")
     return table
 
 

@@ -9,12 +9,12 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
+from bodyschema.learning.status import ChainCalibration, DataOutlook, JointZero, LearntFigure
 
 from .screen import mm, such_zeros
 
 
-def outlook_lines(outlook: Outlook | None) -> list[str]:
+def outlook_lines(outlook: DataOutlook | None) -> list[str]:
     """Return at most two lines on the sufficiency of the data."""
     if outlook is None:
         return ["not known yet"]
@@ -28,7 +28,7 @@ def outlook_lines(outlook: Outlook | None) -> list[str]:
     ]
 
 
-def outlook_sentence(outlook: Outlook) -> str:
+def outlook_sentence(outlook: DataOutlook) -> str:
     best = "no other motion gains more"
     if _other_is_better(outlook):
         best = f"{outlook.best_motion} gains most: {_gain(outlook, outlook.best_motion_m)}"
@@ -54,12 +54,12 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
     facts = Table.grid(padding=(0, 2))
     facts.add_column(no_wrap=True)
     shown = {name: zero for name, zero in calibration.zeros.items() if zero is not None}
-    drawn = [name for name in calibration.zeros if name not in shown]
+    nominal = [name for name in calibration.zeros if name not in shown]
     if shown:
         zeros = ", ".join(f"{name} {_zero(zero, slides=name in slides)}" for name, zero in shown.items())
         facts.add_row("zeros to add", zeros)
-    if drawn:
-        facts.add_row("kept at nominal", f"{', '.join(drawn)}: no motion shows {such_zeros(drawn)}")
+    if nominal:
+        facts.add_row("kept at nominal", f"{', '.join(nominal)}: no motion shows {such_zeros(nominal)}")
     facts.add_row("arm made to", _workmanship(calibration))
     facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
     return Group(
@@ -75,11 +75,11 @@ def _workmanship(calibration: ChainCalibration) -> str:
     return f"about {math.degrees(calibration.axes_rad):.2g}° and {1e3 * calibration.points_m:.2g} mm"
 
 
-def _other_is_better(outlook: Outlook) -> bool:
+def _other_is_better(outlook: DataOutlook) -> bool:
     return outlook.best_motion_m != outlook.like_so_far_m
 
 
-def _gain(outlook: Outlook, after_m: list[float]) -> str:
+def _gain(outlook: DataOutlook, after_m: list[float]) -> str:
     """Return the share of the error beyond noise that the largest number of further pairs would remove."""
     return f"{max(1.0 - after_m[-1] / outlook.error_m, 0.0):.0%}" if outlook.error_m else "0%"
 

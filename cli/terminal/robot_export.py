@@ -153,12 +153,12 @@ def _write_correction(simulation: Simulation, file: Path, heading: str) -> list[
             known = msgspec.json.decode(read_at_most(found), type=_Known).pose_covariance
         except (OSError, msgspec.DecodeError) as error:
             raise ConfigError(f"is not what diagnose wrote: {error}", file=found, remedy="Diagnose again") from error
-    told = write_correction(simulation, file, heading, known)
+    lines = write_correction(simulation, file, heading, known)
     if known is None:
-        told.append(
+        lines.append(
             f"not in it: the pose's covariance, which {DIAGNOSIS} beside {EXTENDED_FILE} has if anything was fitted"
         )
-    return told
+    return lines
 
 
 class _Known(msgspec.Struct, frozen=True):
@@ -193,20 +193,20 @@ def write(simulation: Simulation, out: Path) -> list[str]:
     part = out.with_name(f".{out.stem}.part{out.suffix}")
     heading = f"{simulation.robot.name}, by bodyschema {version('bodyschema')} from {simulation.robot.file.name}"
     try:
-        told = _WRITERS[out.suffix.lower()](simulation, part, heading)
+        lines = _WRITERS[out.suffix.lower()](simulation, part, heading)
         os.replace(part, out)
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror or error}", file=out) from error
     finally:
         part.unlink(missing_ok=True)
-    return told
+    return lines
 
 
 def effects_of(simulation: Simulation) -> str:
     """Return the number of effects of a simulation; those within tolerance of links and drives are counted apart."""
     count, small = len(simulation.effects), len(simulation.background)
-    told = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
-    return f"{told} and {small} small error{'s' if small > 1 else ''} within tolerance" if small else told
+    summary = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
+    return f"{summary} and {small} small error{'s' if small > 1 else ''} within tolerance" if small else summary
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[l
             predicted[f"{out.name} in MuJoCo {version_}"] = replayed(out, simulation.robot.joints, motion)
     elif out.suffix.lower() == DRIVERS:
         # Beside the fit of camera and marker, which changes no background.
-        kept = tuple(effect for effect in simulation.after_moments.all_effects if effect.name in IN_DRIVERS)
+        kept = tuple(effect for effect in simulation.with_permanent_changes.all_effects if effect.name in IN_DRIVERS)
         settings = Simulation(simulation.robot, (), None, kept)
         predicted[f"zeros and scales of {out.name}"] = aligned(Observations.of(recording, settings), settings).predicted
     elif out.suffix.lower() == CORRECTION:

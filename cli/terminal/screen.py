@@ -82,9 +82,11 @@ def plain_table(*headings: str, right: Collection[str] = (), folded: Collection[
 
 def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
     """Return a text of the rejected frames by reason, the most frequent first."""
-    from bodyschema.interfaces.rejections import words_of
+    from bodyschema.interfaces.rejections import rejection_text
 
-    return [(words_of(reason), count) for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1])]
+    return [
+        (rejection_text(reason), count) for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1])
+    ]
 
 
 def coverage_table(status: SamplerStatus, slides: Collection[str] = ()) -> Table:
@@ -125,10 +127,10 @@ def quiet(_said: str) -> None:
 def counted(say: Say, what: str, items: Sequence[T]) -> Iterator[T]:
     """Yield the items in order; report `what` at once, and the number done every few seconds."""
     say(what)
-    told = time.monotonic()
+    last_s = time.monotonic()
     for done, item in enumerate(items):
-        if time.monotonic() - told >= ScreenSettings.tell_every_s:
-            told = time.monotonic()
+        if time.monotonic() - last_s >= ScreenSettings.tell_every_s:
+            last_s = time.monotonic()
             say(f"{what}: {done:,} of {len(items):,}")
         yield item
 
@@ -137,7 +139,7 @@ def counted(say: Say, what: str, items: Sequence[T]) -> Iterator[T]:
 def shown_on(console: Console, name: str) -> Iterator[Say]:
     """Yield a function that shows messages: one updating line on a terminal, a line each elsewhere."""
     if not console.is_terminal:
-        yield lambda said: console.print(f"{name}: {said}", highlight=False, soft_wrap=True)
+        yield lambda text: console.print(f"{name}: {text}", highlight=False, soft_wrap=True)
         return
     # Imported here, because rich's bars take 20 ms.
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -146,4 +148,4 @@ def shown_on(console: Console, name: str) -> Iterator[Say]:
     words = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
     with Progress(SpinnerColumn(), TimeElapsedColumn(), words, console=console, transient=True) as line:
         step = line.add_task(name, total=None)
-        yield lambda said: line.update(step, description=f"{name}: {said}")
+        yield lambda text: line.update(step, description=f"{name}: {text}")

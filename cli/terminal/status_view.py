@@ -29,7 +29,7 @@ from bodyschema.learning.status import OrientationStatus
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ProcessStates:
     """States of the processes; None for one that did not answer."""
 
     sampler: SamplerStatus | None
@@ -56,15 +56,15 @@ class Watcher:
         for process in list(self._sessions):
             self._leave(process)
 
-    def look(self) -> Seen:
+    def look(self) -> ProcessStates:
         """Return their current states."""
         sampler, learner = self._ask("sampler"), self._ask("learner")
-        return Seen(
+        return ProcessStates(
             sampler=None if sampler is None else decode(sampler, SamplerStatus),
             learner=None if learner is None else decode(learner, LearnerStatus),
         )
 
-    def follow(self) -> Iterator[Seen]:
+    def follow(self) -> Iterator[ProcessStates]:
         """Yield their states about once a second, without end."""
         while True:
             yield self.look()
@@ -85,12 +85,12 @@ class Watcher:
             session.__exit__(None, None, None)
 
 
-def as_json(seen: Seen) -> str:
+def as_json(seen: ProcessStates) -> str:
     """Return both states as one line of JSON."""
     return msgspec.json.encode({"schema": 1, "sampler": seen.sampler, "learner": seen.learner}).decode()
 
 
-def screen(seen: Seen, config: ClientConfig) -> RenderableType:
+def screen(seen: ProcessStates, config: ClientConfig) -> RenderableType:
     """Return a screen of both states; a small terminal cuts off the end of the joints' coverage."""
     parts: list[RenderableType] = []
     parts += _absent("sampler", config.route("sampler")) if seen.sampler is None else _sampler(seen.sampler)
@@ -106,8 +106,8 @@ def screen(seen: Seen, config: ClientConfig) -> RenderableType:
 
 
 def _absent(process: str, route: Route) -> list[RenderableType]:
-    said = f"does not answer on {route}. Start it with `bodyschema run {process}`, or both with `bodyschema run`."
-    return [Text.assemble((process, "bold"), " ", (as_typed(said), "yellow"))]
+    message = f"does not answer on {route}. Start it with `bodyschema run {process}`, or both with `bodyschema run`."
+    return [Text.assemble((process, "bold"), " ", (as_typed(message), "yellow"))]
 
 
 def _sampler(status: SamplerStatus) -> list[RenderableType]:
@@ -161,9 +161,9 @@ def _expected(status: LearnerStatus) -> str:
     if (here_m := status.expected_error_m(status.claimed_error_m)) is None:
         return "not known yet"
     anywhere_m = None if status.outlook is None else status.expected_error_m(status.outlook.anywhere_m)
-    said = f"{mm(here_m)} where data is" + ("" if anywhere_m is None else f", {mm(anywhere_m)} over all joints' ranges")
+    text = f"{mm(here_m)} where data is" + ("" if anywhere_m is None else f", {mm(anywhere_m)} over all joints' ranges")
     shared = "" if status.common_error_m is None else f"; {mm(status.common_error_m)} in all: camera calibration"
-    return said + shared
+    return text + shared
 
 
 def _change(status: LearnerStatus) -> Iterator[str]:

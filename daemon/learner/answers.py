@@ -92,18 +92,18 @@ class Answers:
         else:
             posture = joint_vector("posture", wanted.posture, self._joints)
         found = inverse.solve(x, start=start, posture=posture)
-        there = snapshot.predict(found.q[None])
+        prediction = snapshot.predict(found.q[None])
         reply = IkReply(
             q=found.q.tolist(),
             x=found.x.tolist(),
             distance=found.distance,
             converged=found.converged,
             reason=found.reason,
-            sigma=there.sigma[0].tolist(),
-            in_support=bool(there.in_support[0]),
+            sigma=prediction.sigma[0].tolist(),
+            in_support=bool(prediction.in_support[0]),
             model=snapshot.digest,
             pairs=snapshot.pairs,
-            pose=_poses(there)[0],
+            pose=_poses(prediction)[0],
         )
         return encode(reply, request.encoding)
 
@@ -112,11 +112,11 @@ class Answers:
 
         The last one is cached, since building it costs as much as several answers.
         """
-        kept = self._inverse
-        if kept is None or kept[0] is not model:
-            kept = model, InverseKinematics(model, self._robot.lower, self._robot.upper)
-            self._inverse = kept
-        return kept[1]
+        cached = self._inverse
+        if cached is None or cached[0] is not model:
+            cached = model, InverseKinematics(model, self._robot.lower, self._robot.upper)
+            self._inverse = cached
+        return cached[1]
 
     def model(self, _request: Request) -> bytes:
         """Return the best KB-Map as one self-describing file; its metadata name the robot and the answering model."""
@@ -179,7 +179,7 @@ class ExpectedMarker:
         self.published += 1
 
     def _run(self) -> None:
-        said = False
+        has_warned = False
         while not self._stop.is_set():
             try:
                 with ExitStack() as stack:
@@ -188,9 +188,9 @@ class ExpectedMarker:
                         stack.enter_context(ReconnectingSource(self._joints, "the robot's joints", self._clock))
                     )
             except SourceError as error:
-                if not said:
+                if not has_warned:
                     log.warning("the expected marker position is not published: %s; trying again", error)
-                said = True
+                has_warned = True
                 self._stop.wait(Waits.retry_s)
 
     def _follow(self, joints: ReconnectingSource[JointReading]) -> None:

@@ -42,7 +42,7 @@ VERSION = 3
 _PREFIX = struct.Struct("<8sII")
 _CHECKSUM_BYTES = 16
 # Upper bound: with the exact map of 2187 nodes and the state before a change, a checkpoint has 200 MB.
-LARGEST_BYTES = 2**29
+MAX_BYTES = 2**29
 
 
 class CheckpointError(BodyschemaError):
@@ -67,9 +67,9 @@ def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) 
     Raises:
         CheckpointError: the disk is full or read-only, or the state is unusable; the old checkpoint is still there.
     """
-    poisoned = state.poisoned()
-    if poisoned is not None:
-        raise CheckpointError(f"the checkpoint {file} was not written: {poisoned} is not finite or too large")
+    invalid_array = state.invalid_array()
+    if invalid_array is not None:
+        raise CheckpointError(f"the checkpoint {file} was not written: {invalid_array} is not finite or too large")
     data = _encode(state, robot, utc)
     temporary = file.with_name(file.name + ".tmp")
     try:
@@ -113,7 +113,7 @@ def checkpoint_bytes(file: Path) -> bytes:
         CheckpointError: the file cannot be read, is larger than a checkpoint can be, or is a device.
     """
     try:
-        return read_at_most(file, LARGEST_BYTES)
+        return read_at_most(file, MAX_BYTES)
     except OSError as error:
         raise CheckpointError(f"cannot read the checkpoint {file}: {error.strerror}") from error
 
@@ -201,10 +201,12 @@ def _unwritable(file: Path, error: OSError) -> str:
 log = logging.getLogger(__name__)
 
 # Exceptions of a checkpoint whose checksum is right but whose contents do not fit.
-DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
+INVALID_CONTENT_ERRORS = (ArithmeticError, LookupError, TypeError, ValueError)
 
 
-def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tuple[OnlineLearner, str | None]:
+def resume_from_checkpoint(
+    new: Callable[[], OnlineLearner], checkpoint: Path, robot: str
+) -> tuple[OnlineLearner, str | None]:
     """Restore the learner from the newest usable checkpoint.
 
     Args:
@@ -217,7 +219,7 @@ def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tup
     Raises:
         CheckpointError: an unusable checkpoint cannot be moved aside.
     """
-    said: list[str] = []
+    problems: list[str] = []
     for file in generations(checkpoint):
         learning = new()
         try:
@@ -225,19 +227,23 @@ def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tup
             if state is None:
                 continue
             learning.restore(state)
-        except (CheckpointError, StateError, KBMapsError, *DOES_NOT_FIT) as error:
-            unfit = isinstance(error, DOES_NOT_FIT)
+        except (CheckpointError, StateError, KBMapsError, *INVALID_CONTENT_ERRORS) as error:
+            unfit = isinstance(error, INVALID_CONTENT_ERRORS)
             why = f"the checkpoint's parts do not fit: {error!r}" if unfit else str(error)
-            said.append(f"{why}. It was kept as {set_aside(file)}")
+            problems.append(f"{why}. It was kept as {set_aside(file)}")
             continue
         pairs = learning.counters.pairs
         log.info("went on from %s with %d pairs", file, pairs)
-        return learning, _told([*said, f"the learner went on from {file} with {pairs} pairs"]) if said else None
-    return new(), _told([*said, "the learner learns again from the sampler's history"]) if said else None
+        return learning, _log_problems(
+            [*problems, f"the learner went on from {file} with {pairs} pairs"]
+        ) if problems else None
+    return new(), _log_problems(
+        [*problems, "the learner learns again from the sampler's history"]
+    ) if problems else None
 
 
-def _told(said: list[str]) -> str:
-    text = "; ".join(said)
+def _log_problems(problems: list[str]) -> str:
+    text = "; ".join(problems)
     log.error("%s", text)
     return text
 

@@ -44,7 +44,7 @@ class _Stored:
 
     seq: int
     utc: str
-    heard_at: float
+    received_at: float
 
 
 class PairFeed:
@@ -83,7 +83,7 @@ class PairFeed:
     @property
     def behind(self) -> int:
         """Number of pairs known to be stored and not learnt yet."""
-        newest = self._look_ahead()
+        newest = self._newest_stored()
         return 0 if newest is None else max(newest.seq - self._cursor, 0)
 
     def age_s(self, utc: str | None) -> float | None:
@@ -92,10 +92,10 @@ class PairFeed:
         The age is the time from this pair to the newest one known to be stored, by the sampler's clock, plus the time
         since the learner heard of the latter, by its own clock. None before any pair.
         """
-        newest = self._look_ahead()
+        newest = self._newest_stored()
         if utc is None or newest is None:
             return None
-        return self._clock.now() - newest.heard_at + _seconds(utc, newest.utc)
+        return self._clock.now() - newest.received_at + _seconds(utc, newest.utc)
 
     def offer(self, payload: bytes) -> None:
         """Accept a published pair."""
@@ -139,11 +139,11 @@ class PairFeed:
         if self._missed:
             self._missed, self._behind, self._retry_at = False, True, 0.0
         if payload is not None:
-            self._take(payload)
+            self._receive(payload)
         if self._behind and self._clock.now() >= self._retry_at:
             self._catch_up()
 
-    def _take(self, payload: bytes) -> None:
+    def _receive(self, payload: bytes) -> None:
         try:
             message = decode(payload, PairMessage)
         except RequestError as error:
@@ -153,9 +153,9 @@ class PairFeed:
             if self._store is None:
                 self._behind = True
             elif message.store != self._store:
-                self._meet_foreign(message.store)
+                self._note_foreign_store(message.store)
                 self._learning.refuse()
-            elif message.seq == self._cursor + 1 and self._learnt(message):
+            elif message.seq == self._cursor + 1 and self._learn(message):
                 self._cursor = message.seq
             elif message.seq > self._cursor:
                 self._behind = True
@@ -175,13 +175,13 @@ class PairFeed:
                 return
             self._note_stored(reply)
             with self.lock:
-                if begin == self._cursor + 1 and self._end_of(reply):
+                if begin == self._cursor + 1 and self._learn_page(reply):
                     return
 
-    def _end_of(self, reply: Page) -> bool:
+    def _learn_page(self, reply: Page) -> bool:
         """Learn a page of history; return True if there is nothing more to request."""
         if self._store not in (None, reply.store):
-            self._meet_foreign(reply.store)
+            self._note_foreign_store(reply.store)
             self._behind = False
             return True
         if reply.last_seq < self._cursor:
@@ -195,30 +195,30 @@ class PairFeed:
         new = [message for message in reply.pairs if message.seq > self._cursor]
         for message in new:
             self._beat()
-            self._pass_over(message.seq - self._cursor - 1)
-            self._learnt(message)
+            self._skip_missing(message.seq - self._cursor - 1)
+            self._learn(message)
             self._store, self._cursor = reply.store, message.seq
         self._learning.recovered(len(new))
         self._behind = self._cursor < reply.last_seq and bool(new)
         return not self._behind
 
-    def _look_ahead(self) -> _Stored | None:
+    def _newest_stored(self) -> _Stored | None:
         """Return the newest stored pair that is known; the last publication is decoded only when this is called."""
         published, newest = self._published, self._newest
         if published is None:
             return newest
-        payload, heard_at = published
+        payload, received_at = published
         try:
             stamp = decode(payload, _Stamp)
         except RequestError:
             return newest
         if self._store not in (None, stamp.store) or (newest is not None and stamp.seq < newest.seq):
             return newest
-        return _Stored(stamp.seq, stamp.utc, heard_at)
+        return _Stored(stamp.seq, stamp.utc, received_at)
 
     def _note_stored(self, reply: Page) -> None:
         """Note the newest stored pair of a page of history; request it if the store extends beyond the page."""
-        known = self._look_ahead()
+        known = self._newest_stored()
         if self._store not in (None, reply.store) or (known is not None and known.seq >= reply.last_seq):
             return
         pairs = reply.pairs
@@ -230,7 +230,7 @@ class PairFeed:
         utc = pairs[-1].utc if pairs and isinstance(pairs[-1], PairMessage) else ""
         self._newest = _Stored(reply.last_seq, utc, self._clock.now())
 
-    def _pass_over(self, missing: int) -> None:
+    def _skip_missing(self, missing: int) -> None:
         """Continue after pairs that the sampler no longer has; it numbers without gaps, so they existed before."""
         if missing > 0:
             log.warning(
@@ -241,7 +241,7 @@ class PairFeed:
             )
             self._learning.missed(missing)
 
-    def _learnt(self, message: PairMessage | Unreadable) -> bool:
+    def _learn(self, message: PairMessage | Unreadable) -> bool:
         try:
             if isinstance(message, Unreadable):
                 raise RequestError(message.why)
@@ -256,7 +256,7 @@ class PairFeed:
         self.refused = str(error)
         self._learning.refuse()
 
-    def _meet_foreign(self, store: str) -> None:
+    def _note_foreign_store(self, store: str) -> None:
         self.foreign = store
         self.problem = (
             f"pairs now come from the store {store}, but this learner learnt from {self._store}; they are not mixed. "

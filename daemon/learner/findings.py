@@ -10,24 +10,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
+from bodyschema.calibration.chain_figures import ChainFigures, limited_to_exact_pairs, tolerances_determined
 from bodyschema.calibration.plausibility.check import plausibility
 from bodyschema.calibration.plausibility.search import SearchSettings
 from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
 from bodyschema.daemon.transport.status import UNDECIDED, Change
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
+from bodyschema.learning.data_outlook import LearnerEvidence, ResidualScatter, forecast
 from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
-from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable_indices
 from bodyschema.learning.status import (
     JOINT,
     ChainCalibration,
     ChangeRecord,
+    DataOutlook,
     JointZero,
     KindOfChange,
     LearntFigure,
-    Outlook,
 )
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
@@ -42,19 +42,19 @@ class _Settings:
     least_probability: float = 0.01  # kinds less probable than this are not reported
 
 
-class FindingTurns:
+class FindingsBudget:
     """Limiter of all users of the background thread together to 1/`share` of a processor. For that thread alone.
 
     Attributes:
         due_at: time of the next permitted finding.
-        spent: returns the thread's CPU time [s]. On a busy machine most of the wall time is waiting, and a rest of ten
+        cpu_s: returns the thread's CPU time [s]. On a busy machine most of the wall time is waiting, and a rest of ten
             times as long would suppress findings for a quarter of an hour.
     """
 
-    def __init__(self, spent: Callable[[], float] = time.thread_time) -> None:
-        self.due_at, self.spent = -math.inf, spent
+    def __init__(self, cpu_s: Callable[[], float] = time.thread_time) -> None:
+        self.due_at, self.cpu_s = -math.inf, cpu_s
 
-    def took(self, begin: float, seconds: float) -> None:
+    def record(self, begin: float, seconds: float) -> None:
         """Note that one finding took `seconds` from `begin` on."""
         self.due_at = begin + _Settings.share * seconds
 
@@ -65,7 +65,7 @@ class Findings:
     Only the background thread may compute them. Any thread may read the results.
 
     Attributes:
-        doubts: reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints.
+        data_problems: reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints.
     """
 
     def __init__(
@@ -74,15 +74,15 @@ class Findings:
         robot: RobotDescription,
         clock: Clock,
         robots: int = 1,  # number of robots that share the background thread
-        turns: FindingTurns | None = None,  # their common time limit
+        budget: FindingsBudget | None = None,  # their common time limit
     ) -> None:
         self._learning, self._robot, self._clock = learning, robot, clock
-        self._turns = turns or FindingTurns()
-        self._parts = _Settings.share * robots
-        self._found_of: tuple[ChainBelief | None, str] = None, ""
+        self._budget = budget or FindingsBudget()
+        self._budget_divisor = _Settings.share * robots
+        self._inputs_used: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
-        self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
-        self._checked, self.doubts = 0, ()
+        self._found: tuple[ChainCalibration | None, DataOutlook | None] = None, None
+        self._checked, self.data_problems = 0, ()
 
     @property
     def calibration(self) -> ChainCalibration | None:
@@ -90,7 +90,7 @@ class Findings:
         return self._found[0] if self._learning.belief is not None else None
 
     @property
-    def outlook(self) -> Outlook | None:
+    def outlook(self) -> DataOutlook | None:
         """Expected gain of further pairs; None until a solution with the present tool answers."""
         answers = self._learning.belief is not None and self._learning.snapshot.answering in SOLVED
         return self._found[1] if answers else None
@@ -98,22 +98,22 @@ class Findings:
     @property
     def at_rest(self) -> bool:
         """True if the findings are up to date with the current chain and model."""
-        return self._found_of == self._present
+        return self._inputs_used == self._inputs
 
     @property
-    def _present(self) -> tuple[ChainBelief | None, str]:
+    def _inputs(self) -> tuple[ChainBelief | None, str]:
         return self._learning.belief, self._learning.snapshot.answering
 
     def renew(self) -> None:
         """Compute all findings again if their inputs have changed and the time limit permits."""
         self._check()
-        begin, present = self._clock.now(), self._present
+        begin, present = self._clock.now(), self._inputs
         if present[0] is None:
-            self._found_of, self._found = present, (None, None)  # the findings belong to another tool
+            self._inputs_used, self._found = present, (None, None)  # the findings belong to another tool
             return
-        if present == self._found_of or begin < max(self._due_at, self._turns.due_at):
+        if present == self._inputs_used or begin < max(self._due_at, self._budget.due_at):
             return
-        self._found_of, known, spent = present, self._learning.known(), self._turns.spent()
+        self._inputs_used, known, cpu_s = present, self._learning.known(), self._budget.cpu_s()
         if known is None:
             self._found = None, None
             return
@@ -122,33 +122,33 @@ class Findings:
         except (KBMapsError, np.linalg.LinAlgError) as error:
             log.warning("status has no calibration for now: %s", error)
             self._found = None, None
-        seconds = self._turns.spent() - spent
-        self._turns.took(begin, seconds)
-        self._due_at = begin + max(self._parts * seconds, _Settings.every_s)
+        seconds = self._budget.cpu_s() - cpu_s
+        self._budget.record(begin, seconds)
+        self._due_at = begin + max(self._budget_divisor * seconds, _Settings.every_s)
 
     def _check(self) -> None:
         """Check the pairs with the present tool once there are enough, and again whenever their number has doubled."""
         begin, count = self._clock.now(), self._learning.counters.since_change
         if count < self._checked:
-            self._checked, self.doubts = 0, ()
-        if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
+            self._checked, self.data_problems = 0, ()
+        if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._budget.due_at:
             return
-        spent = self._turns.spent()
+        cpu_s = self._budget.cpu_s()
         q, x = self._learning.kept(SearchSettings.rows)
         if len(q) < FEWEST_ROWS:  # the others are doubted
             return
         self._checked = count
-        self.doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
-        self._turns.took(begin, self._turns.spent() - spent)
+        self.data_problems = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
+        self._budget.record(begin, self._budget.cpu_s() - cpu_s)
 
 
-def _found(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainCalibration, Outlook | None]:
-    scatter = Scatter.of(known)
+def _found(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainCalibration, DataOutlook | None]:
+    scatter = ResidualScatter.of(known)
     outlook = forecast(known, scatter, robot.joints) if known.solved else None
     return calibrated(robot, known, scatter), outlook
 
 
-def calibrated(robot: RobotDescription, known: LearnerEvidence, scatter: Scatter) -> ChainCalibration:
+def calibrated(robot: RobotDescription, known: LearnerEvidence, scatter: ResidualScatter) -> ChainCalibration:
     """Return the chain in the terms of robot.toml."""
     found, workmanship = figures(robot, known)
     numbers = [
@@ -184,16 +184,18 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
     tolerances, but seldom sharply, so the figures average over all probable tolerances.
     """
     wide = known.tolerances
-    made = [(wide.axes, wide.points)]
-    made += [
+    candidates = [(wide.axes, wide.points)]
+    candidates += [
         (axes, points) for axes, points in ToleranceSettings.workmanship if axes < wide.axes and points < wide.points
     ]
     prior = known.nominal.belief(known.wide.parameters.reference, wide)
-    belief = no_surer_than_possible(known.wide, prior, robot)
-    beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]
-    kept, shares = probable(np.array([evidence for _, evidence in beliefs]))
-    told = is_told([made[k] for k in kept])
-    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if told else None
+    belief = limited_to_exact_pairs(known.wide, prior, robot)
+    beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in candidates]
+    kept, shares = probable_indices(np.array([evidence for _, evidence in beliefs]))
+    is_determined = tolerances_determined([candidates[k] for k in kept])
+    return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), candidates[
+        kept[0]
+    ] if is_determined else None
 
 
 class Changes:
@@ -205,16 +207,18 @@ class Changes:
     """
 
     def __init__(self, joints: Sequence[str], change: ChangeRecord | None = None) -> None:
-        self._joints, self._told = tuple(joints), change
+        self._joints, self._reported = tuple(joints), change
 
     def note(self, change: ChangeRecord | None, *, rolled_back: bool = False) -> None:
         """Log the news about the last change: its detection, its cause, its rollback."""
-        was, self._told = self._told, change
+        previous, self._reported = self._reported, change
         if rolled_back:
-            log.info("rolled back to the model before %s", "the change" if was is None else f"pair {was.first_seq}")
-        elif change is not None and (was is None or was.noticed_seq != change.noticed_seq):
+            log.info(
+                "rolled back to the model before %s", "the change" if previous is None else f"pair {previous.first_seq}"
+            )
+        elif change is not None and (previous is None or previous.noticed_seq != change.noticed_seq):
             log.info("%s", self._sentence(change))
-        elif change is not None and was is not None and self._name(was) != self._name(change):
+        elif change is not None and previous is not None and self._name(previous) != self._name(change):
             log.info("the change at pair %d is %s", change.first_seq, self._name(change))
 
     def status(self, change: ChangeRecord | None, *, can_roll_back: bool) -> Change | None:
@@ -229,7 +233,7 @@ class Changes:
             found=change.found,
             kind=self._name(change),
             probabilities={
-                self._of(kind): round(kind.probability, 3)
+                self._kind_name(kind): round(kind.probability, 3)
                 for kind in change.kinds
                 if kind.probability > _Settings.least_probability
             },
@@ -248,7 +252,7 @@ class Changes:
         )
 
     def _name(self, change: ChangeRecord) -> str:
-        return UNDECIDED if change.named is None else self._of(change.named)
+        return UNDECIDED if change.named is None else self._kind_name(change.named)
 
-    def _of(self, kind: KindOfChange) -> str:
+    def _kind_name(self, kind: KindOfChange) -> str:
         return kind.name if kind.joint is None else f"{JOINT} {self._joints[kind.joint]}"

@@ -18,8 +18,15 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learner.findings import FindingTurns
-from bodyschema.daemon.learner.learner import LISTENING, LOOPS, Learner, more_rarely, show_name, status_line
+from bodyschema.daemon.learner.findings import FindingsBudget
+from bodyschema.daemon.learner.learner import (
+    LISTENING,
+    LOOPS,
+    Learner,
+    interval_factor,
+    set_os_thread_name,
+    status_line,
+)
 from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.daemon.service.notify import Notifier
@@ -57,7 +64,7 @@ class Background:
         self, workers: Sequence[Learner], service: Service, clock: Clock, stop: threading.Event, *, share: float = 1.0
     ) -> None:
         self._workers, self._service, self._clock, self._stop = workers, service, clock, stop
-        self._rest = 1.0 / share - 1.0
+        self._idle_ratio = 1.0 / share - 1.0
         self._idle_since = [clock.now()] * len(workers)
 
     def run(self) -> None:
@@ -67,7 +74,7 @@ class Background:
         low priority would learn nothing for minutes there, and make all threads of the process wait when it is
         preempted while it holds Python's interpreter lock.
         """
-        if self._rest == 0.0:
+        if self._idle_ratio == 0.0:
             with contextlib.suppress(OSError):  # optional: without it answers are slightly later
                 os.sched_setscheduler(threading.get_native_id(), os.SCHED_BATCH, os.sched_param(0))
         while not self._stop.is_set():
@@ -82,7 +89,7 @@ class Background:
                 self._stop.wait(Waits.retry_s)
                 continue
             if worked:
-                self._stop.wait(max(self._rest * (time.thread_time() - begin), _Settings.breath_s))
+                self._stop.wait(max(self._idle_ratio * (time.thread_time() - begin), _Settings.breath_s))
             elif not self._stop.wait(_Settings.idle_s):
                 for worker, since in zip(self._workers, self._idle_since, strict=True):
                     if self._clock.now() - since > _Settings.solve_when_idle_s:
@@ -91,17 +98,17 @@ class Background:
     def _round(self) -> bool:
         """Do one piece for each; return True if there was any."""
         worked = [worker.work() for worker in self._workers]
-        for place, busy in enumerate(worked):
+        for index, busy in enumerate(worked):
             if busy:
-                self._idle_since[place] = self._clock.now()
+                self._idle_since[index] = self._clock.now()
         return any(worked)
 
 
 log = logging.getLogger(__name__)
 
 
-def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, notifier: Notifier) -> None:
-    """Learn and answer for all robots until `wishes` requests the end.
+def run_learners(configs: Sequence[Config], clock: Clock, signals: SignalFlags, notifier: Notifier) -> None:
+    """Learn and answer for all robots until `signals` requests the end.
 
     Args:
         notifier: is notified of the completed start, of working loops, and of the learners' states.
@@ -119,24 +126,24 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
         process = stack.enter_context(SolverProcess())
         bus = stack.enter_context(ZenohSession(settings=session_settings(configs)))
         for config in configs:
-            stack.enter_context(alone(config))
+            stack.enter_context(exclusive_state(config))
         learners = _learners(configs, process, bus, clock, service)
         gc.collect()
         gc.freeze()  # objects of the start-up need not be scanned again
-        failed = stack.enter_context(_working(learners, service, clock))
+        failed = stack.enter_context(_background_thread(learners, service, clock))
         for config, learner in zip(configs, learners, strict=True):
             stack.enter_context(learner.serving())
             log.info("the learner of %s answers on %s", config.robot.name, config.tables.zenoh.learner)
         service.ready()
         tell_parent_serving()
-        attend(
-            learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], wishes, service, failed
+        serve_until_stopped(
+            learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], signals, service, failed
         )
         service.stopping()
 
 
 @contextmanager
-def alone(config: Config) -> Iterator[None]:
+def exclusive_state(config: Config) -> Iterator[None]:
     """Keep other learners from the state of this one; raise StoreError if another learner has it."""
     try:
         config.state_dir.mkdir(parents=True, exist_ok=True)
@@ -164,7 +171,7 @@ def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
         if config.robot.name in names:
             raise ConfigError(f"two robots are called {config.robot.name}", file=config.file, remedy="Rename one")
         names.add(config.robot.name)
-        if _way(config) != _way(first):
+        if _router_and_identity(config) != _router_and_identity(first):
             raise ConfigError(
                 f"[zenoh] has another router, or other certificates, than {first.file}",
                 file=config.file,
@@ -172,14 +179,14 @@ def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
             )
     for key in ("listen/endpoints", "connect/endpoints"):
         settings[key] = list(dict.fromkeys(end for c in configs for end in c.zenoh_settings("learner")[key]))
-    identity = _way(first)[1]
+    identity = _router_and_identity(first)[1]
     if identity is not None and any(end.startswith(SECURE) for end in settings["listen/endpoints"]):
-        who = {config.robot.name: config.tables.zenoh.access or Names() for config in configs}
-        settings["access_control"] = access_control(who, by_user=identity.by_user)
+        names_by_robot = {config.robot.name: config.tables.zenoh.access or Names() for config in configs}
+        settings["access_control"] = access_control(names_by_robot, by_user=identity.by_user)
     return settings
 
 
-def _way(config: Config) -> tuple[str, Any]:
+def _router_and_identity(config: Config) -> tuple[str, Any]:
     return config.tables.zenoh.router, config.tables.zenoh.identity(config.file.parent)
 
 
@@ -192,28 +199,30 @@ def _learners(
 ) -> list[Learner]:
     if len(configs) == 1:
         return [Learner(configs[0], process, bus, clock, service)]
-    shared, turns = SolverPool(process), FindingTurns()
+    shared, budget = SolverPool(process), FindingsBudget()
     return [
-        Learner(config, shared.seat(), bus, clock, service, loop=_loop(config), robots=len(configs), turns=turns)
+        Learner(
+            config, shared.new_solver(), bus, clock, service, loop=_loop(config), robots=len(configs), budget=budget
+        )
         for config in configs
     ]
 
 
 @contextmanager
-def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Iterator[list[Exception]]:
+def _background_thread(learners: Sequence[Learner], service: Service, clock: Clock) -> Iterator[list[Exception]]:
     """Run the background thread; an exception that ended it early is in the list."""
     stop, failed = threading.Event(), list[Exception]()
     share = 1.0 if len(learners) == 1 else _Settings.shared_work
     background = Background(learners, service, clock, stop, share=share)
 
-    def guarded() -> None:
-        show_name()
+    def run_guarded() -> None:
+        set_os_thread_name()
         try:
             background.run()
         except Exception as error:
             failed.append(error)
 
-    thread = threading.Thread(target=guarded, name="background")
+    thread = threading.Thread(target=run_guarded, name="background")
     thread.start()
     try:
         yield failed
@@ -222,29 +231,29 @@ def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Ite
         thread.join()
 
 
-def attend(
+def serve_until_stopped(
     learners: Sequence[Learner],
     publishers: Sequence[Any],
-    wishes: SignalFlags,
+    signals: SignalFlags,
     service: Service,
     failed: Sequence[Exception],
 ) -> None:
     """Publish states, write checkpoints and serve requests until the end is requested."""
-    every_s = Waits.status_every_s * more_rarely(len(learners))  # a status takes milliseconds
+    every_s = Waits.status_every_s * interval_factor(len(learners))  # a status takes milliseconds
     begin = time.monotonic()
     due = [begin + every_s * k / len(learners) for k in range(len(learners))]
-    while not wishes.ending:
+    while not signals.ending:
         # Taken before the round: a request during it is for every learner, in the next round.
-        reloading, wishes.reloading = wishes.reloading, False
+        reloading, signals.reloading = signals.reloading, False
         for k, (learner, publish) in enumerate(zip(learners, publishers, strict=True)):
             if time.monotonic() >= due[k]:
                 due[k] = time.monotonic() + every_s
                 status = learner.status()
                 publish(encode(status))
                 line = status_line(status)
-                service.tell(line if len(learners) == 1 else f"{len(learners)} robots; {status.robot}: {line}")
+                service.report_status(line if len(learners) == 1 else f"{len(learners)} robots; {status.robot}: {line}")
             if reloading:
-                service.follow(learner.reload)
+                service.reload_and_report(learner.reload)
             learner.tick()
         if failed:
             raise failed[0]

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.answers import Answers, ExpectedMarker
-from bodyschema.daemon.learner.checkpoint import CheckpointError, go_on, write_checkpoint
+from bodyschema.daemon.learner.checkpoint import CheckpointError, resume_from_checkpoint, write_checkpoint
 from bodyschema.daemon.learner.feed import FeedSettings, PairFeed
-from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
+from bodyschema.daemon.learner.findings import Changes, Findings, FindingsBudget
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service, with_health
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 class _Settings:
     history_limit_s: float = 5.0  # how long a page of stored pairs is waited for
     # How long pairs may wait to be evaluated as one batch, per robot of a process, and at most [s].
-    together_s, longest_together_s = 0.08, 1.0
+    batch_wait_s, longest_together_s = 0.08, 1.0
     # Up to this many robots per process, states and checkpoints are as frequent as for one alone.
     as_often_as_one: int = 10
 
@@ -70,26 +70,28 @@ class Learner:
         *,
         loop: str = LISTENING,  # name of its loop of new pairs for the watchdog
         robots: int = 1,  # number of robots in the process, including this one
-        turns: FindingTurns | None = None,  # their common time limit for calibration and outlook
+        budget: FindingsBudget | None = None,  # their common time limit for calibration and outlook
     ) -> None:
         """Restore the learner from its checkpoint; nothing is declared yet."""
         self._config, self._bus, self._clock = config, bus, clock
-        self._service = Service.nobodys(clock) if service is None else service
+        self._service = Service.unsupervised(clock) if service is None else service
         self._loop = loop
         self._settings, self._robot = config.tables.learner, config.robot
         self._keys = Keys(config.robot.name)
         self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._nominal = NominalModel.extended_by(config.simulation)
         common, self._calibration_problem = _common_variance(config)
-        self._learning, self._set_aside = go_on(
-            lambda: OnlineLearner(self._nominal, self._settings, solver, together_s=together_s(robots), common=common),
+        self._learning, self._restore_problem = resume_from_checkpoint(
+            lambda: OnlineLearner(
+                self._nominal, self._settings, solver, batch_wait_s=batch_wait_s(robots), common=common
+            ),
             config.checkpoint_file,
             config.robot.name,
         )
         self._feed = PairFeed(self._learning, self._history, clock, lambda: self._service.beat(loop))
-        self._findings = Findings(self._learning, config.robot, clock, robots, turns)
+        self._findings = Findings(self._learning, config.robot, clock, robots, budget)
         self._answers = Answers(self._learning, config.robot, self._feed.age_s)
-        self._more_rarely = more_rarely(robots)
+        self._interval_factor = interval_factor(robots)
         self._sampler_alive = False
         self._started_at = clock.now()
         self._checkpointed_at: float | None = None
@@ -97,7 +99,7 @@ class Learner:
         self._checkpoint_problem: str | None = None
         self._checkpoint_lock = threading.Lock()
         self._changes = Changes(self._robot.joints, self._learning.change)
-        self._rested_with: int | None = None
+        self._pairs_at_rest: int | None = None
         self._stop = threading.Event()
         self._failure: Exception | None = None
 
@@ -127,7 +129,7 @@ class Learner:
         self._service.beat("status")
         waited_s = self._clock.now() - (self._checkpointed_at or self._started_at)
         new = self._learning.counters.pairs != self._checkpointed_pairs
-        if new and waited_s >= self._settings.checkpoint_every_s * self._more_rarely:
+        if new and waited_s >= self._settings.checkpoint_every_s * self._interval_factor:
             self.checkpoint()
 
     def checkpoint(self) -> None:
@@ -148,7 +150,7 @@ class Learner:
     def status(self) -> LearnerStatus:
         """Return the learner's state."""
         counters = self._learning.counters
-        at_rest = self._rested_with == counters.pairs  # before the status below: it is final then
+        at_rest = self._pairs_at_rest == counters.pairs  # before the status below: it is final then
         snapshot, recent = self._learning.snapshot, self._learning.recent()
         now = self._clock.now()
         written = self._checkpointed_at if self._checkpoint_problem is None else None
@@ -199,10 +201,10 @@ class Learner:
                 f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
                 "`bodyschema run sampler`. Predictions go on"
             )
-        for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside, self._calibration_problem):
+        for problem in (self._feed.problem, self._checkpoint_problem, self._restore_problem, self._calibration_problem):
             if problem is not None:
                 yield problem
-        yield from self._findings.doubts
+        yield from self._findings.data_problems
         behind = self._feed.behind
         if behind >= FeedSettings.behind and not self._feed.paused:
             age_s = self._feed.age_s(self._learning.snapshot.newest_utc)
@@ -239,7 +241,7 @@ class Learner:
 
     def _command(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command
-        carried_out: dict[str, Callable[[], str]] = {
+        handlers: dict[str, Callable[[], str]] = {
             "pause": self._pause,
             "resume": self._resume,
             "reset_to_prior": self._reset_to_prior,
@@ -248,11 +250,11 @@ class Learner:
             "checkpoint": self._checkpoint_now,
             "reload": self.reload,
         }
-        if command not in carried_out:
+        if command not in handlers:
             raise RequestError(
                 f"the learner has nothing to do with {command}. Send it to {self._keys.command('sampler')}"
             )
-        message = carried_out[command]()
+        message = handlers[command]()
         log.info("command %s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)
 
@@ -312,12 +314,12 @@ class Learner:
         return found.message("learner")
 
     def _learn_pairs(self) -> None:
-        show_name()
+        set_os_thread_name()
         try:
             while not self._stop.is_set():
                 self._service.beat(self._loop)
                 self._feed.step(Waits.read_s)
-                self._learning.judge_due(self._clock.now())
+                self._learning.learn_due(self._clock.now())
                 with self._feed.lock:
                     self._changes.note(self._learning.change)
         except Exception as error:
@@ -328,26 +330,26 @@ class Learner:
         self._findings.renew()
         worked = self._learning.work()
         pairs = self._learning.counters.pairs
-        self._rested_with = pairs if self._learning.at_rest and self._findings.at_rest else None
+        self._pairs_at_rest = pairs if self._learning.at_rest and self._findings.at_rest else None
         return worked
 
     def restart_solver(self) -> None:
         """Send the pairs to a new solver."""
         self._learning.restart_solver()
-        self._rested_with = None
+        self._pairs_at_rest = None
 
     def solve_soon(self) -> None:
         """Start the solver on all pairs learnt so far, since there is no other work."""
         self._learning.solve_soon()
 
 
-def show_name() -> None:
+def set_os_thread_name() -> None:
     """Show the beginning of this thread's Python name in `top -H` and `ps -L`, where the system supports it."""
     with contextlib.suppress(OSError):
         Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text(threading.current_thread().name[:15])
 
 
-def more_rarely(robots: int) -> float:
+def interval_factor(robots: int) -> float:
     """Return the factor by which states and checkpoints are less frequent when `robots` robots share a process."""
     return max(1.0, robots / _Settings.as_often_as_one)
 
@@ -371,12 +373,14 @@ def _common_variance(config: Config) -> tuple[Callable[[FloatArray], FloatArray]
     return None if error is None else error.variance, None
 
 
-def together_s(robots: int) -> float:
+def batch_wait_s(robots: int) -> float:
     """Return how long pairs may wait to be evaluated together [s] when `robots` robots share a process."""
-    return 0.0 if robots == 1 else min(_Settings.together_s * robots, _Settings.longest_together_s)
+    return 0.0 if robots == 1 else min(_Settings.batch_wait_s * robots, _Settings.longest_together_s)
 
 
 def status_line(status: LearnerStatus) -> str:
     """Return the learner's state as one line."""
-    claimed = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
-    return with_health(f"{status.state}, {status.pairs} pairs, {status.answering} answers{claimed}", status.health)
+    predicted_error = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
+    return with_health(
+        f"{status.state}, {status.pairs} pairs, {status.answering} answers{predicted_error}", status.health
+    )

@@ -18,53 +18,53 @@ class SolverPool:
 
     def __init__(self, process: SolverProcess) -> None:
         self._process = process
-        self._seats: list[PooledSolver] = []
-        self._solving: PooledSolver | None = None
+        self._solvers: list[PooledSolver] = []
+        self._active: PooledSolver | None = None
         self._turn = 0
 
-    def seat(self) -> PooledSolver:
+    def new_solver(self) -> PooledSolver:
         """Add a robot, and return its solver."""
-        seat = PooledSolver(self, self._process, len(self._seats))
-        self._seats.append(seat)
-        return seat
+        new_solver = PooledSolver(self, self._process, len(self._solvers))
+        self._solvers.append(new_solver)
+        return new_solver
 
-    def attend(self) -> None:
+    def dispatch(self) -> None:
         """Collect the process's answers, and give the turn to the robot with the greatest need.
 
         Raises:
             SolverLostError: the process has ended; all seats are empty.
         """
         try:
-            if self._solving is not None and (solved := self._process.poll()) is not None:
-                self._solving.answers.append(solved)
+            if self._active is not None and (solved := self._process.poll()) is not None:
+                self._active.answers.append(solved)
                 if solved.last:
-                    self._solving = None
-            if self._solving is None:
-                self._give_turn()
+                    self._active = None
+            if self._active is None:
+                self._start_next()
         except SolverLostError:
-            self._solving = None
-            for seat in self._seats:
-                seat.clear()
+            self._active = None
+            for solver in self._solvers:
+                solver.clear()
             raise
 
-    def _give_turn(self) -> None:
-        waiting = [seat for seat in self._seats if seat.asked]
+    def _start_next(self) -> None:
+        waiting = [solver for solver in self._solvers if solver.is_requested]
         if not waiting:
             return
         self._turn += 1
-        seat = max(waiting, key=lambda seat: seat.need(self._turn))
-        seat.tell(self._turn)
-        self._solving = seat
+        solver = max(waiting, key=lambda solver: solver.urgency(self._turn))
+        solver.submit(self._turn)
+        self._active = solver
 
 
 class PooledSolver:
     """A `Solver` of one robot, in a process shared with others."""
 
-    def __init__(self, shared: SolverPool, process: SolverProcess, robot: int) -> None:
-        self._shared, self._process, self._robot = shared, process, robot
+    def __init__(self, pool: SolverPool, process: SolverProcess, robot: int) -> None:
+        self._pool, self._process, self._robot = pool, process, robot
         self._orders: deque[Callable[[], None]] = deque()
-        self._pairs = self._new = self._had_turn = 0
-        self.asked = False  # True if a solution is wanted that the process does not compute yet
+        self._pairs = self._new = self._last_turn = 0
+        self.is_requested = False  # True if a solution is wanted that the process does not compute yet
         self.answers: deque[Solved] = deque()  # answers not fetched yet
 
     def start(self, task: Task) -> None:
@@ -80,27 +80,27 @@ class PooledSolver:
 
     def solve(self) -> None:
         """Request the solution for all pairs so far, for this robot's next turn."""
-        self.asked = True
+        self.is_requested = True
 
     def poll(self) -> Solved | None:
-        self._shared.attend()
+        self._pool.dispatch()
         return self.answers.popleft() if self.answers else None
 
-    def need(self, turn: int) -> float:
+    def urgency(self, turn: int) -> float:
         """Return the urgency: the relative growth of the pairs, times the number of turns of others since."""
-        return (turn - self._had_turn) * self._new / max(self._pairs, 1)
+        return (turn - self._last_turn) * self._new / max(self._pairs, 1)
 
-    def tell(self, turn: int) -> None:
+    def submit(self, turn: int) -> None:
         """Send all queued orders to the process, and request a solution."""
         while self._orders:
             self._orders[0]()
             self._orders.popleft()
         self._process.solve(self._robot)
-        self._pairs, self._new, self._had_turn, self.asked = self._pairs + self._new, 0, turn, False
+        self._pairs, self._new, self._last_turn, self.is_requested = self._pairs + self._new, 0, turn, False
 
     def clear(self) -> None:
         """Discard all orders and answers."""
         self._orders.clear()
         self.answers.clear()
         self._pairs = self._new = 0
-        self.asked = False
+        self.is_requested = False

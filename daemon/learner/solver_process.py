@@ -106,8 +106,11 @@ class SolverProcess:
     def __init__(self) -> None:
         self._child: subprocess.Popen[bytes] | None = None
         self._received, self._unsent = bytearray(), bytearray()
-        self._owes = False
-        self._moved_s, self._looked_at = 0.0, 0.0  # the child's processor time at the last look, and when that was
+        self._unanswered = False
+        self._last_progress_s, self._checked_at = (
+            0.0,
+            0.0,
+        )  # the child's processor time at the last look, and when that was
 
     def __enter__(self) -> Self:
         return self
@@ -151,38 +154,38 @@ class SolverProcess:
     def solve(self, robot: int = 0) -> None:
         """Request the solution for all pairs so far."""
         self._send(Solve(robot))
-        self._owes, self._looked_at = True, time.monotonic()
+        self._unanswered, self._checked_at = True, time.monotonic()
 
     def poll(self) -> Solved | None:
         """Return the next solution that has arrived, without waiting."""
         child = self._child
         if child is None or child.stdout is None:
             return None
-        self._hand_over(0.0)
+        self._flush(0.0)
         while select.select([child.stdout], [], [], 0)[0]:
             part = os.read(child.stdout.fileno(), 1 << 20)
             if not part:
                 raise self._lost()
             self._received += part
         solved = self._next_solution()
-        if solved is None and self._owes:
+        if solved is None and self._unanswered:
             self._require_progress(child.pid)
         elif solved is not None:
-            self._owes = not solved.last
+            self._unanswered = not solved.last
         return solved
 
     def _require_progress(self, pid: int) -> None:
-        if time.monotonic() - self._looked_at < _Settings.hung_after_s:
+        if time.monotonic() - self._checked_at < _Settings.hung_after_s:
             return
         try:
             used_s = time.clock_gettime(~pid << 3 | 2)  # as in clock_getcpuclockid(3)
         except OSError:  # it has ended, as the next look at its pipe shows, or this system has no such clock
             return
-        if used_s == self._moved_s:
+        if used_s == self._last_progress_s:
             os.kill(pid, signal.SIGKILL)
             self._end()
             raise SolverLostError(f"the solver did nothing for {_Settings.hung_after_s:.0f} s; it is started again")
-        self._moved_s, self._looked_at = used_s, time.monotonic()
+        self._last_progress_s, self._checked_at = used_s, time.monotonic()
 
     def _next_solution(self) -> Solved | None:
         if len(self._received) < _LENGTH.size:
@@ -201,9 +204,9 @@ class SolverProcess:
         if self._child is None:
             raise SolverLostError("the solver has not been started")
         self._unsent += _framed(order)
-        self._hand_over(_Settings.reads_within_s)
+        self._flush(_Settings.reads_within_s)
 
-    def _hand_over(self, within_s: float) -> None:
+    def _flush(self, within_s: float) -> None:
         """Write what the child reads within this time each; `poll` writes the rest: a stopped child blocks nothing."""
         child = self._child
         if child is None or child.stdin is None:
@@ -219,7 +222,7 @@ class SolverProcess:
         return SolverLostError(f"the solver's process ended with exit code {code}; it is started again")
 
     def _end(self) -> int | None:
-        child, self._child, self._owes = self._child, None, False
+        child, self._child, self._unanswered = self._child, None, False
         self._received.clear()
         self._unsent.clear()
         if child is None or child.stdin is None or child.stdout is None:

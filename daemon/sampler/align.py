@@ -57,7 +57,7 @@ class JointBuffer:
             self._expecting = True
             self._changed.notify_all()
 
-    def silence(self) -> None:
+    def expect_no_readings(self) -> None:
         """Expect no readings for now: the encoders are lost or have ended. The next `put` resets this."""
         with self._changed:
             self._expecting = False
@@ -91,11 +91,11 @@ class JointBuffer:
         """
         self.forget_before(t)
         with self._changed:
-            self._changed.wait_for(lambda: not self._expecting or self._reaches(t), timeout_s)
+            self._changed.wait_for(lambda: not self._expecting or self._has_reached(t), timeout_s)
             self._forget_before(t)
-            if not self._reaches(t) or self._readings[0].t > t:
+            if not self._has_reached(t) or self._readings[0].t > t:
                 return Reason.NO_JOINTS
-            before, after = self._around(t)
+            before, after = self._neighbours(t)
         if before.t == t:
             return before.q
         if after.t - before.t > self.max_gap_s + ROUNDING_S:
@@ -103,15 +103,15 @@ class JointBuffer:
         fraction = (t - before.t) / (after.t - before.t)
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))
 
-    def slack(self, t: float) -> FloatArray:
+    def time_uncertainty_motion(self, t: float) -> FloatArray:
         """Return the joints' motion within the time uncertainty of the readings around `t`, shape (d,) [rad or m].
 
         Call it only for a `t` at which `at` returned angles.
         """
         with self._changed:
-            before, after = self._around(t)
-        sigma_s, apart_s = max(before.t_sigma, after.t_sigma), max(after.t - before.t, ROUNDING_S)
-        return frozen_array(sigma_s / apart_s * joint_difference(after.q, before.q, self._prismatic))
+            before, after = self._neighbours(t)
+        sigma_s, gap_s = max(before.t_sigma, after.t_sigma), max(after.t - before.t, ROUNDING_S)
+        return frozen_array(sigma_s / gap_s * joint_difference(after.q, before.q, self._prismatic))
 
     def moved(self, t: float, during_s: float, timeout_s: float) -> FloatArray | Reason:
         """Return the motion of the joints within `during_s` of time `t`, shape (d,) [rad or m], or a reason like `at`.
@@ -128,7 +128,7 @@ class JointBuffer:
             return after
         return frozen_array(0.5 * during_s / span_s * joint_difference(after, before, self._prismatic))
 
-    def _reaches(self, t: float) -> bool:
+    def _has_reached(self, t: float) -> bool:
         return bool(self._readings) and self._readings[-1].t >= t
 
     def _forget_before(self, t: float) -> None:
@@ -136,7 +136,7 @@ class JointBuffer:
             self._readings.popleft()
         self._changed.notify_all()
 
-    def _around(self, t: float) -> tuple[JointReading, JointReading]:
+    def _neighbours(self, t: float) -> tuple[JointReading, JointReading]:
         """Return the last reading at or before `t`, and the one after it."""
         for before, after in pairwise(self._readings):
             if after.t > t:

@@ -13,8 +13,8 @@ import msgspec
 
 from bodyschema.daemon.config import Config, DaemonConfig
 from bodyschema.daemon.sampler.align import JointBuffer
-from bodyschema.daemon.sampler.gate import Gate
-from bodyschema.daemon.sampler.sources import TellsHealth
+from bodyschema.daemon.sampler.gate import PairGate
+from bodyschema.daemon.sampler.sources import ReportsHealth
 from bodyschema.daemon.service.reload import reload
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock, JointSource
@@ -28,13 +28,13 @@ log = logging.getLogger(__name__)
 
 Device = Mapping[str, Any]
 
-ANEW = "or keep it, and start again with another --state-dir"
+OR_NEW_STORE = "or keep it, and start again with another --state-dir"
 IN_SERVO = {"homing_offset_ticks": "homing_offset", "drive_mode": "drive_mode"}
 IN_ROBOT_TOML = ("zero_ticks", "direction")
 
 
 @runtime_checkable
-class KeepsRecord(Protocol):
+class IdentifiesDevices(Protocol):
     """Encoders that can identify themselves; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
@@ -52,23 +52,23 @@ class DeviceWatch:
         Args:
             joints: queried if they keep a record.
         """
-        self._joints = joints if isinstance(joints, KeepsRecord) else None
+        self._joints = joints if isinstance(joints, IdentifiesDevices) else None
         self._store, self._wall = store, wall
         stored = store.reader.devices()
-        self._before: Sequence[Device] = stored[-1].record if stored else ()
-        self.kept: Sequence[Device] = ()  # the record of this session; empty before there is one
+        self._previous_record: Sequence[Device] = stored[-1].record if stored else ()
+        self.current_record: Sequence[Device] = ()  # the record of this session; empty before there is one
         self.changes: list[str] = []  # differences from the devices of earlier pairs, with remedies
 
-    def look(self) -> bool:
+    def check(self) -> bool:
         """Store the record if it is new; return True if pairs from now on are not comparable with earlier ones."""
         record = () if self._joints is None else self._joints.record
-        if not record or record == self.kept:
+        if not record or record == self.current_record:
             return False
-        found = differences(self._before, record)
+        found = differences(self._previous_record, record)
         self._store.note_devices(self._wall.utc(), record)
-        self._before = self.kept = record
-        for said in found:
-            log.warning("%s", said)
+        self._previous_record = self.current_record = record
+        for sentence in found:
+            log.warning("%s", sentence)
         self.changes += found
         return bool(found)
 
@@ -76,28 +76,30 @@ class DeviceWatch:
 def differences(before: Sequence[Device], now: Sequence[Device]) -> list[str]:
     """Return a sentence with a remedy for each difference between devices that affects the measurements."""
     then = {device["joint"]: device for device in before}
-    return [said for device in now if device["joint"] in then for said in _said(then[device["joint"]], device)]
+    return [
+        sentence for device in now if device["joint"] in then for sentence in _sentences(then[device["joint"]], device)
+    ]
 
 
-def _said(before: Device, now: Device) -> Iterator[str]:
+def _sentences(before: Device, now: Device) -> Iterator[str]:
     joint, changed = now["joint"], {key for key in now if key in before and before[key] != now[key]}
     if "model" in changed:
         yield (
             f"joint {joint!r} has another servo than the pairs before: {before['model']} then, {now['model']} now. "
-            f"Its zero is another one: put the old one back, {ANEW}"
+            f"Its zero is another one: put the old one back, {OR_NEW_STORE}"
         )
         return
     for key, name in IN_SERVO.items():
         if key in changed:
             yield (
                 f"the zero of {joint!r} is not what the pairs before were measured with: {name} was {before[key]}, is "
-                f"{now[key]}. Write it back (`bodyschema servos {name}={before[key]} --joint {joint}`), {ANEW}"
+                f"{now[key]}. Write it back (`bodyschema servos {name}={before[key]} --joint {joint}`), {OR_NEW_STORE}"
             )
     for key in IN_ROBOT_TOML:
         if key in changed:
             yield (
                 f"the zero of {joint!r} is not what the pairs before were measured with: {key} in robot.toml was "
-                f"{before[key]}, is {now[key]}. Put it back, {ANEW}"
+                f"{before[key]}, is {now[key]}. Put it back, {OR_NEW_STORE}"
             )
     if "firmware" in changed:
         yield (
@@ -136,13 +138,13 @@ class SamplerRules:
         devices: DeviceWatch,
         wall: Clock,
         *,
-        gate: Gate,
+        gate: PairGate,
         buffer: JointBuffer,
-        deciding: threading.Lock,  # held while a pair is decided on and stored, so that no pair sees half of a change
+        pair_lock: threading.Lock,  # held while a pair is decided on and stored, so that no pair sees half of a change
     ) -> None:
         self._config, self._store, self._devices, self._wall = config, store, devices, wall
-        self._gate, self._buffer, self._deciding = gate, buffer, deciding
-        self._one_at_a_time = threading.Lock()
+        self._gate, self._buffer, self._pair_lock = gate, buffer, pair_lock
+        self._reload_lock = threading.Lock()
 
     def reload(self) -> str:
         """Read robot.toml again and return a message about the result; sampling continues meanwhile.
@@ -151,7 +153,7 @@ class SamplerRules:
             ConfigError: robot.toml is invalid; nothing changed.
             StoreError: the new session cannot be stored; nothing changed.
         """
-        with self._one_at_a_time:
+        with self._reload_lock:
             found = reload(self._config, TABLES, CHANGEABLE)
             if found.changed:
                 self._follow(found.config)
@@ -165,23 +167,23 @@ class SamplerRules:
         """
         rules = self._config.tables.daemon
         most_bytes = None if rules.keep_mb is None else 1e6 * rules.keep_mb
-        with self._deciding:
+        with self._pair_lock:
             deleted = self._store.trim(Keep(rules.keep_days, most_bytes), self._wall.utc())
         if deleted:
             log.info("the oldest %d pairs were deleted, as [daemon] keep_days and keep_mb say", deleted)
 
     def _follow(self, config: Config) -> None:
         session, rules = session_of(config, self._wall), config.tables.daemon
-        with self._deciding:
-            self._store.go_on_with(session)
-            self._devices.kept = ()
+        with self._pair_lock:
+            self._store.switch_session(session)
+            self._devices.current_record = ()
             self._gate.follow(rules)
             self._buffer.max_gap_s = rules.max_reading_gap_s
             self._config = config
 
 
 @runtime_checkable
-class Servos(TellsHealth, Protocol):
+class Servos(ReportsHealth, Protocol):
     """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
@@ -191,7 +193,7 @@ class Servos(TellsHealth, Protocol):
 
 
 @runtime_checkable
-class AsksForTurns(Protocol):
+class NeedsTurnCount(Protocol):
     """Encoders that may have lost a joint's turn count."""
 
     @property
@@ -206,7 +208,7 @@ def accept_turns(encoders: object) -> str:
     Raises:
         RequestError: no turn count was lost.
     """
-    if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
+    if not isinstance(encoders, NeedsTurnCount) or not encoders.asks_for_turns:
         raise RequestError("no joint has lost its turn count: there is nothing to accept")
     encoders.accept_turns()
     log.info("accept_turns: the turns nearest to where the joints were are taken")

@@ -27,7 +27,7 @@ class _Fix(NamedTuple):
     x: FloatArray
 
 
-class Gate:
+class PairGate:
     """Gate that accepts a measurement if its joint-space step from the last pair is neither too small nor implausible.
 
     A step is the Euclidean norm over all joints in degrees; prismatic joints count with `metres_per_degree`. A step
@@ -49,10 +49,10 @@ class Gate:
         self.segment = 0 if last is None else last.segment  # number of the current segment; 0 before the first
         self._q: FloatArray | None = None if last is None else last.q
         self._t: float | None = None
-        self._broken = True
-        self._believed: _Fix | None = None
-        self._suspect: _Fix | None = None
-        self._suspects = 0
+        self._starts_segment = True
+        self._accepted: _Fix | None = None
+        self._unconfirmed: _Fix | None = None
+        self._confirmations = 0
 
     def follow(self, rules: DaemonConfig) -> None:
         """Apply these rules from now on; the segment continues."""
@@ -61,8 +61,8 @@ class Gate:
 
     def break_segment(self) -> None:
         """Start a new segment with the next pair, regardless of its step."""
-        self._broken = True
-        self._believed = None
+        self._starts_segment = True
+        self._accepted = None
 
     def offer(self, t: float, q: FloatArray, x: FloatArray) -> int | Reason:
         """Return the segment if joint angles `q` [rad or m] (d,) and marker `x` [m] (3,) make a pair, or the reason.
@@ -71,7 +71,7 @@ class Gate:
             t: time of the measurement [s], later than all before.
         """
         rules = self._rules
-        if not rules.any_step and not self._believe(_Fix(t, x)):
+        if not rules.any_step and not self._is_plausible(_Fix(t, x)):
             return Reason.IMPLAUSIBLE_SPEED
         step_deg = np.inf
         if self._q is not None:
@@ -79,28 +79,28 @@ class Gate:
         if step_deg < rules.min_step_deg and not rules.any_step:
             return Reason.TOO_NEAR
         paused = self._t is None or t - self._t > _Settings.segment_gap_s
-        if self._broken or paused or step_deg > rules.max_step_deg:
+        if self._starts_segment or paused or step_deg > rules.max_step_deg:
             self.segment += 1
-        self._t, self._q, self._broken = t, q, False
+        self._t, self._q, self._starts_segment = t, q, False
         return self.segment
 
     def is_too_fast(self, moved: FloatArray) -> bool:
         """Return True if `moved` [rad or m] (d,), the motion within the time uncertainty, is too large for a pair."""
         return float(np.linalg.norm(moved * self._degrees_per_unit)) > _Settings.most_time_error_deg
 
-    def _believe(self, fix: _Fix) -> bool:
-        jumped = self._reachable(self._suspect, fix)
-        last = self._believed
-        if last is not None and fix.t - last.t <= _Settings.segment_gap_s and not self._reachable(last, fix):
-            self._suspects = self._suspects + 1 if jumped else 1
-            self._suspect = fix
-            if self._suspects < _Settings.confirmations:
+    def _is_plausible(self, fix: _Fix) -> bool:
+        is_consistent = self._is_reachable(self._unconfirmed, fix)
+        last = self._accepted
+        if last is not None and fix.t - last.t <= _Settings.segment_gap_s and not self._is_reachable(last, fix):
+            self._confirmations = self._confirmations + 1 if is_consistent else 1
+            self._unconfirmed = fix
+            if self._confirmations < _Settings.confirmations:
                 return False
-        self._broken |= jumped
-        self._believed, self._suspect, self._suspects = fix, None, 0
+        self._starts_segment |= is_consistent
+        self._accepted, self._unconfirmed, self._confirmations = fix, None, 0
         return True
 
-    def _reachable(self, last: _Fix | None, fix: _Fix) -> bool:
+    def _is_reachable(self, last: _Fix | None, fix: _Fix) -> bool:
         if last is None:
             return False
         distance = float(np.linalg.norm(fix.x - last.x))

@@ -21,7 +21,7 @@ from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 
-from .sources import Head, Sources
+from .sources import GazeMode, Sources
 
 log = logging.getLogger(__name__)
 
@@ -47,14 +47,14 @@ class HandModel:
 
     def positions(self, q: FloatArray) -> FloatArray:
         """Return marker positions (n, 3) [m] at q (n, d) [rad], all by one model, which the first row selects."""
-        learnt = self._learnt(q) if self._clock.now() >= self._ask_s else None
+        learnt = self._from_learner(q) if self._clock.now() >= self._ask_s else None
         source = "nominal" if learnt is None else "learnt"
         if source != self.source:
             log.info("the gaze goes by the %s model", source)
             self.source = source
         return self._chain.positions(q) if learnt is None else learnt
 
-    def _learnt(self, q: FloatArray) -> FloatArray | None:
+    def _from_learner(self, q: FloatArray) -> FloatArray | None:
         try:
             reply = decode(self._predict(encode(JointsRequest(q.tolist()))), PredictReply)
         except (BusError, RequestError):
@@ -68,7 +68,7 @@ class HandModel:
 class GazeLoop:
     """Loop that aims the head in a separate thread. If it fails, the target expires and the head stands still."""
 
-    def __init__(self, robot: RobotDescription, head: Head, model: HandModel) -> None:
+    def __init__(self, robot: RobotDescription, head: GazeMode, model: HandModel) -> None:
         """Store the settings; nothing is started yet.
 
         Raises:

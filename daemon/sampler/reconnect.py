@@ -53,7 +53,7 @@ class ReconnectingSource(Generic[R_co]):
         self._wait_s = Waits.first_s
         self._next_try = 0.0
         self._is_open = False
-        self._refused = ""
+        self._last_refusal = ""
         self.trouble: str | None = None
         self.losses = 0
 
@@ -84,25 +84,25 @@ class ReconnectingSource(Generic[R_co]):
         if not self._is_open and not self._try_again(timeout_s):
             return None
         try:
-            seen = self._source.read(timeout_s)
+            value = self._source.read(timeout_s)
         except SourceLost as error:
             self._opened.close()
-            self._lost(error)
+            self._note_loss(error)
             return None
-        if seen is not None and self.trouble is not None:
+        if value is not None and self.trouble is not None:
             log.info("%s are back", self._name)
-            self.trouble, self._wait_s, self._refused = None, Waits.first_s, ""
-        return seen
+            self.trouble, self._wait_s, self._last_refusal = None, Waits.first_s, ""
+        return value
 
     def _try_again(self, timeout_s: float) -> bool:
-        left = self._next_try - self._wall.now()
-        if left > 0:
-            self._sleep(min(left, timeout_s))
+        remaining_s = self._next_try - self._wall.now()
+        if remaining_s > 0:
+            self._sleep(min(remaining_s, timeout_s))
             return False
         try:
             self._open()
         except SourceError as error:
-            self._lost(error)
+            self._note_loss(error)
             device = self._forbidden()
             if device is None:
                 return False
@@ -111,21 +111,21 @@ class ReconnectingSource(Generic[R_co]):
             ) from error
         return True
 
-    def _lost(self, error: SourceError) -> None:
+    def _note_loss(self, error: SourceError) -> None:
         if self.trouble is None:
             log.warning("%s are lost: %s; trying to open them again", self._name, error)
             self.losses += 1
         else:
             self._wait_s = min(2 * self._wait_s, Waits.longest_s)
             # Problems that need a person are logged, each once.
-            if not isinstance(error, SourceLost) and str(error) != self._refused:
-                self._refused = str(error)
+            if not isinstance(error, SourceLost) and str(error) != self._last_refusal:
+                self._last_refusal = str(error)
                 log.warning("%s cannot be taken again: %s; trying on", self._name, error)
         self._is_open = False
-        said = error.brief if isinstance(error, SourceLost) else error
-        self.trouble = f"{self._name} are lost ({said}); trying to open them again"
-        soon_s = error.retry_s if isinstance(error, SourceLost) else None
-        self._next_try = self._wall.now() + (self._wait_s if soon_s is None else soon_s)
+        reason = error.brief if isinstance(error, SourceLost) else error
+        self.trouble = f"{self._name} are lost ({reason}); trying to open them again"
+        retry_s = error.retry_s if isinstance(error, SourceLost) else None
+        self._next_try = self._wall.now() + (self._wait_s if retry_s is None else retry_s)
 
 
 # A disk that takes longer per pair costs frames [s].
@@ -139,19 +139,19 @@ class ResilientWriter:
 
     def __init__(self, store: PairStore, wall: Clock) -> None:
         self._store, self._wall = store, wall
-        self._refused: str | None = None
-        self._lost = 0
-        self._slow: tuple[float, float] | None = None
+        self._problem: str | None = None
+        self._dropped = 0
+        self._last_slow: tuple[float, float] | None = None
 
     @property
     def complaints(self) -> list[str]:
         """Current problems with the disk, in sentences."""
-        said: list[str] = []
-        if self._refused is not None:
-            said.append(f"{self._refused}. No pairs are taken until the disk does ({self._lost} frames so far)")
-        if self._slow is not None and self._wall.now() - self._slow[0] < RepeatSettings.repeated_s:
-            said.append(f"the disk of {self._store.file} is slow: a pair took {self._slow[1]:.1f} s")
-        return said
+        problems: list[str] = []
+        if self._problem is not None:
+            problems.append(f"{self._problem}. No pairs are taken until the disk does ({self._dropped} frames so far)")
+        if self._last_slow is not None and self._wall.now() - self._last_slow[0] < RepeatSettings.repeated_s:
+            problems.append(f"the disk of {self._store.file} is slow: a pair took {self._last_slow[1]:.1f} s")
+        return problems
 
     def append(self, segment: int, q: FloatArray, fix: MarkerFix) -> Pair | None:
         """Return the committed pair; None if the disk did not accept it.
@@ -160,9 +160,9 @@ class ResilientWriter:
             StoreError: the store is damaged, or no longer a store.
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
-        if pair is not None and self._refused is not None:
+        if pair is not None and self._problem is not None:
             log.info("the disk takes pairs again")
-            self._refused, self._lost = None, 0
+            self._problem, self._dropped = None, 0
         return pair
 
     def attempt(self, write: Callable[[], T]) -> T | None:
@@ -175,11 +175,11 @@ class ResilientWriter:
         try:
             return write()
         except StoreUnwritable as error:
-            if self._refused is None:
+            if self._problem is None:
                 log.error("%s; it is tried again with each pair", error)
-            self._refused, self._lost = str(error), self._lost + 1
+            self._problem, self._dropped = str(error), self._dropped + 1
             return None
         finally:
             now = self._wall.now()
             if now - begun > SLOW_S:
-                self._slow = now, now - begun
+                self._last_slow = now, now - begun

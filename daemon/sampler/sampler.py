@@ -28,11 +28,11 @@ from bodyschema.recordings.store.store import PairStore
 
 from .align import JointBuffer
 from .counters import SamplerCounters
-from .gate import Gate
+from .gate import PairGate
 from .gaze_loop import gaze_of
 from .history import LARGEST_REPLY, answer_pairs
 from .reconnect import ReconnectingSource, ResilientWriter
-from .sources import Sources, TellsHealth, answer_simulation, asked
+from .sources import ReportsHealth, Sources, answer_simulation, request_power
 
 log = logging.getLogger(__name__)
 
@@ -78,34 +78,34 @@ class Sampler:
             )
         self._config, self._bus, self._store, self._exit_at_end = config, bus, store, exit_at_end
         self._wall = SystemClock()  # for rates and UTC; all other times are the sources'
-        self._service = Service.nobodys(self._wall) if service is None else service
+        self._service = Service.unsupervised(self._wall) if service is None else service
         self._keys = Keys(config.robot.name)
         self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._powered = {drive.name: drive for drive in sources.powered}
         held = config.robot.robot.hold == "zero_force"
-        self._bears = self._powered.get(ZERO_FORCE) if held else None
-        self._cameras, self._seen_by = sources.cameras, sources.seen_by
+        self._arm_support = self._powered.get(ZERO_FORCE) if held else None
+        self._cameras, self._marker_source_name = sources.cameras, sources.marker_source_name
         self._gaze = gaze_of(config.robot, sources, bus, self._wall)
         self._picture = sources.picture
         self._simulation, self._source_clock = sources.simulation, sources.clock
         self._joints = ReconnectingSource(sources.joints, "the encoders", self._wall, forbidden=self._service.forbidden)
         self._encoders, self._devices = sources.joints, DeviceWatch(sources.joints, store, self._wall)
         self._marker = ReconnectingSource(
-            sources.marker, sources.seen_by, self._wall, forbidden=self._service.forbidden
+            sources.marker, sources.marker_source_name, self._wall, forbidden=self._service.forbidden
         )
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
         self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=_Settings.around_s)
-        self._gate = Gate(rules, prismatic, store.last())
-        self._storing = ResilientWriter(store, self._wall)
-        self._tally = SamplerCounters(config.robot, self._wall, store.audit.joint_ranges)
+        self._gate = PairGate(rules, prismatic, store.last())
+        self._writer = ResilientWriter(store, self._wall)
+        self._counters = SamplerCounters(config.robot, self._wall, store.audit.joint_ranges)
         self._seq = store.audit.newest
         self._publish = bus.publisher(self._keys.pair, cache=LARGEST_REPLY)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = self._reloading = False
         # After a pause is acknowledged, no pair may follow.
-        self._deciding = threading.Lock()
+        self._pair_lock = threading.Lock()
         self._rules = SamplerRules(
-            config, store, self._devices, self._wall, gate=self._gate, buffer=self._buffer, deciding=self._deciding
+            config, store, self._devices, self._wall, gate=self._gate, buffer=self._buffer, pair_lock=self._pair_lock
         )
         self._paused = False
         self._resumed_at = -math.inf
@@ -130,12 +130,12 @@ class Sampler:
             StoreError: the store is damaged; the pair was not published, and no pair followed.
             SourceError: a source could not be opened at the start.
         """
-        self._service.tell("opening encoders and cameras")
+        self._service.report_status("opening encoders and cameras")
         with ExitStack() as stack:
             stack.callback(self._service.stopping)
             stack.enter_context(self._joints)
             stack.enter_context(self._marker)
-            self._devices.look()
+            self._devices.check()
             reader = threading.Thread(target=self._read_encoders, name="encoders")
             reader.start()
             stack.callback(reader.join)
@@ -152,12 +152,12 @@ class Sampler:
                 self._serve_history()
             except Exception as error:
                 self._failure = error
-                self._tell()
+                self._publish_state()
                 raise
 
     def status(self) -> SamplerStatus:
         """Return the sampler's state; from any thread."""
-        tally = self._tally
+        counters = self._counters
         servos = self._encoders if isinstance(self._encoders, Servos) else None
         return SamplerStatus(
             robot=self._config.robot.name,
@@ -165,13 +165,13 @@ class Sampler:
             state=self._state(),
             pairs=self._seq,
             segment=self._gate.segment,
-            uptime_s=tally.uptime_s,
-            frames=tally.frames,
-            frames_per_s=tally.frames_per_s,
-            readings_per_s=tally.readings_per_s,
-            pairs_per_s=tally.pairs_per_s,
-            rejected=tally.rejected,
-            coverage=tally.coverage,
+            uptime_s=counters.uptime_s,
+            frames=counters.frames,
+            frames_per_s=counters.frames_per_s,
+            readings_per_s=counters.readings_per_s,
+            pairs_per_s=counters.pairs_per_s,
+            rejected=counters.rejected,
+            coverage=counters.coverage,
             disk_free_bytes=disk_free(self._store.file),
             health=self._health(),
             servos={} if servos is None else dict(servos.servo_health),
@@ -184,15 +184,15 @@ class Sampler:
         bus, keys = self._bus, self._keys
         bus.answer(keys.pairs, lambda request: answer_pairs(self._store.reader, request))
         bus.answer(keys.status("sampler"), lambda request: encode(self.status(), request.encoding))
-        bus.answer(keys.command("sampler"), self._obey)
+        bus.answer(keys.command("sampler"), self._handle_command)
         if self._picture is not None:
-            bus.answer(keys.picture, lambda _: self._shown(), encoding="image/jpeg")
+            bus.answer(keys.picture, lambda _: self._picture_bytes(), encoding="image/jpeg")
         if self._simulation is not None:
             world, clock = self._simulation, self._source_clock
             bus.answer(keys.simulation, lambda request: answer_simulation(world, clock, request))
         bus.token(keys.alive("sampler"))
 
-    def _shown(self) -> bytes:
+    def _picture_bytes(self) -> bytes:
         picture = None if self._picture is None else self._picture()
         if picture is None:
             raise RequestError("no image has come yet")
@@ -200,22 +200,22 @@ class Sampler:
 
     def _sample(self) -> None:
         while not self._stopping:
-            self._tell_when_due()
+            self._publish_state_when_due()
             try:
-                seen = self._marker.read(Waits.read_s)
+                detection = self._marker.read(Waits.read_s)
             except SourceEnded:
                 break
             self._check_sources()
-            if seen is None:
+            if detection is None:
                 self._buffer.make_room()
                 continue
             self._last_frame = self._wall.now()
-            self._tally.frames += 1
-            if self._tally.readings:
+            self._counters.frames += 1
+            if self._counters.readings:
                 self._service.ready()
-            reason = self._take(seen)
+            reason = self._process(detection)
             if reason is not None:
-                self._tally.reject(reason)
+                self._counters.reject(reason)
 
     def _serve_history(self) -> None:
         self._check_sources()
@@ -224,40 +224,40 @@ class Sampler:
         self._ended = True
         self._service.ready()
         log.info("the sources are through; %d pairs are in the store", self._seq)
-        self._tell()
+        self._publish_state()
         while not (self._stopping or self._exit_at_end):
             time.sleep(Waits.read_s)
-            self._tell_when_due()
+            self._publish_state_when_due()
 
-    def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
+    def _process(self, detection: MarkerFix | MarkerMiss) -> Reason | None:
         """Make a pair from a detection, or return the reason why not."""
-        self._buffer.forget_before(seen.t)
-        if self._paused or seen.t <= self._resumed_at:
+        self._buffer.forget_before(detection.t)
+        if self._paused or detection.t <= self._resumed_at:
             self._gate.break_segment()
             return Reason.PAUSED
-        if isinstance(seen, MarkerMiss):
-            return seen.reason
-        if not (np.isfinite(seen.x).all() and np.isfinite(seen.cov).all()):
+        if isinstance(detection, MarkerMiss):
+            return detection.reason
+        if not (np.isfinite(detection.x).all() and np.isfinite(detection.cov).all()):
             return Reason.NOT_FINITE
-        q = self._angles(seen)
+        q = self._angles(detection)
         if isinstance(q, Reason):
             return q
-        if self._bears is not None and self._bears.state != "on":
+        if self._arm_support is not None and self._arm_support.state != "on":
             self._gate.break_segment()
             return Reason.NOT_BORNE
-        with self._deciding:
+        with self._pair_lock:
             if self._paused:
                 self._gate.break_segment()
                 return Reason.PAUSED
-            others = self._storing.attempt(self._devices.look)
-            if others is None:
+            devices_changed = self._writer.attempt(self._devices.check)
+            if devices_changed is None:
                 return Reason.NOT_STORED
-            if others:
+            if devices_changed:
                 self._gate.break_segment()
-            verdict = self._gate.offer(seen.t, q, seen.x)
+            verdict = self._gate.offer(detection.t, q, detection.x)
             if isinstance(verdict, Reason):
                 return verdict
-            return self._accept(verdict, q, seen)
+            return self._accept(verdict, q, detection)
 
     def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
         """Return the joint angles at the time of a fix, if they are accurate enough despite that time's uncertainty."""
@@ -268,17 +268,17 @@ class Sampler:
             if self._gate.is_too_fast(moved):
                 return Reason.MOVING
         q = self._buffer.at(fix.t, _Settings.joints_timeout_s)
-        if not isinstance(q, Reason) and self._gate.is_too_fast(self._buffer.slack(fix.t)):
+        if not isinstance(q, Reason) and self._gate.is_too_fast(self._buffer.time_uncertainty_motion(fix.t)):
             return Reason.LATE_JOINTS
         return q
 
     def _accept(self, segment: int, q: FloatArray, fix: MarkerFix) -> Reason | None:
-        pair = self._storing.append(segment, q, fix)
+        pair = self._writer.append(segment, q, fix)
         if pair is None:
             self._gate.break_segment()
             return Reason.NOT_STORED
         self._seq = pair.seq
-        self._tally.accept(q)
+        self._counters.accept(q)
         self._publish(encode(pair_to_wire(pair)))
         return None
 
@@ -298,10 +298,10 @@ class Sampler:
                 if reading is not None:
                     self._take_reading(reading)
                 elif self._joints.trouble is not None:
-                    self._buffer.silence()
+                    self._buffer.expect_no_readings()
         except SourceEnded:
-            self._service.leave("encoders")
-            self._buffer.silence()
+            self._service.remove_loop("encoders")
+            self._buffer.expect_no_readings()
         except Exception as error:
             log.exception("the encoders' thread failed")
             self._failure = error
@@ -309,7 +309,7 @@ class Sampler:
 
     def _take_reading(self, reading: JointReading) -> None:
         self._last_reading = self._wall.now()
-        self._tally.readings += 1
+        self._counters.readings += 1
         if np.isfinite(reading.q).all():
             self._buffer.put(reading)
             return
@@ -318,13 +318,13 @@ class Sampler:
             joint = self._config.robot.joints[int(np.argmin(np.isfinite(reading.q)))]
             log.warning("the encoder of joint %r gave a number that is not finite; such readings are not used", joint)
 
-    def _obey(self, request: Request) -> bytes:
+    def _handle_command(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command
         if command == "accept_turns":
             return encode(CommandReply(command, accept_turns(self._encoders)), request.encoding)
-        name, _, way = command.rpartition("_")
-        if way in ("on", "off"):
-            return encode(CommandReply(command, self._power(name, on=way == "on")), request.encoding)
+        name, _, switch = command.rpartition("_")
+        if switch in ("on", "off"):
+            return encode(CommandReply(command, self._power(name, on=switch == "on")), request.encoding)
         if command == "reload":
             message = self._rules.reload()
             log.info("robot.toml was read again: %s", message)
@@ -336,7 +336,7 @@ class Sampler:
         if command == "resume" and self._paused:
             # A frame still in transit shows the arm during the pause.
             self._resumed_at = self._source_clock.now()
-        with self._deciding:
+        with self._pair_lock:
             self._paused = command == "pause"
         message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
         log.info("%s: %s", command, message)
@@ -347,27 +347,27 @@ class Sampler:
             raise RequestError(f"{name} is of a real arm: in the simulation the head follows the hand by itself")
         if name not in self._powered:
             raise RequestError(f"{name} is not configured: docs/zero_force.md has its table [drivers.dynamixel.{name}]")
-        said = asked(self._powered[name], on=on)
-        log.info("%s", said)
-        return said
+        answer = request_power(self._powered[name], on=on)
+        log.info("%s", answer)
+        return answer
 
-    def _tell_when_due(self) -> None:
+    def _publish_state_when_due(self) -> None:
         self._service.beat("frames")
         if self._reloading:
             self._reloading = False
             # In a separate thread, because frames do not wait.
-            threading.Thread(target=self._service.follow, args=(self._rules.reload,), name="reload").start()
-        self._tally.tick()
+            threading.Thread(target=self._service.reload_and_report, args=(self._rules.reload,), name="reload").start()
+        self._counters.tick()
         if self._wall.now() >= self._next_status:
             self._rules.trim()
-            self._tell()
+            self._publish_state()
 
-    def _tell(self) -> None:
+    def _publish_state(self) -> None:
         self._next_status = self._wall.now() + Waits.status_every_s
         status = self.status()
         self._publish_status(encode(status))
         line = f"{status.state}, {status.pairs} pairs, {status.pairs_per_s:.1f}/s"
-        self._service.tell(with_health(line, status.health))
+        self._service.report_status(with_health(line, status.health))
 
     def _state(self) -> str:
         if self._failure is not None:
@@ -377,32 +377,32 @@ class Sampler:
         return "paused" if self._paused else "running"
 
     def _health(self) -> list[str]:
-        said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
-        said += self._encoders.health if isinstance(self._encoders, TellsHealth) else ()
-        said += self._devices.changes + self._storing.complaints
+        problems: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
+        problems += self._encoders.health if isinstance(self._encoders, ReportsHealth) else ()
+        problems += self._devices.changes + self._writer.complaints
         if self._failure is not None:
-            said.append(str(self._failure))
+            problems.append(str(self._failure))
         elif not self._ended:
-            said += self._silences() + self._tally.complaints
-        said += [text for drive in self._powered.values() for text in drive.complaints]
+            problems += self._silent_sources() + self._counters.complaints
+        problems += [text for drive in self._powered.values() for text in drive.complaints]
         if self._cameras is not None and self._marker.trouble is None:
-            said += self._cameras.health
-        if self._bears is not None and self._bears.state != "on":
-            said.append(
-                f"{ZERO_FORCE} is to bear the arm ([robot] hold) and is {self._bears.state}: no pairs are taken"
+            problems += self._cameras.health
+        if self._arm_support is not None and self._arm_support.state != "on":
+            problems.append(
+                f"{ZERO_FORCE} is to bear the arm ([robot] hold) and is {self._arm_support.state}: no pairs are taken"
             )
         if self._bad_readings:
-            said.append(f"{self._bad_readings} encoder readings were not finite and were not used")
+            problems.append(f"{self._bad_readings} encoder readings were not finite and were not used")
         if disk_free(self._store.file) < LOW_DISK_BYTES:
-            said.append(f"the disk of {self._store.file} is nearly full")
-        said += self._store.complaints
-        return list(dict.fromkeys(said))  # servos repeat the complaints of their drives
+            problems.append(f"the disk of {self._store.file} is nearly full")
+        problems += self._store.complaints
+        return list(dict.fromkeys(problems))  # servos repeat the complaints of their drives
 
-    def _silences(self) -> list[str]:
+    def _silent_sources(self) -> list[str]:
         now = self._wall.now()
         silent = (
             ("the encoders", self._joints.trouble, self._last_reading),
-            (self._seen_by, self._marker.trouble, self._last_frame),
+            (self._marker_source_name, self._marker.trouble, self._last_frame),
         )
         return [
             f"nothing has come from {name} for {now - since:.0f} s"

@@ -41,7 +41,7 @@ class GroundTruth(Protocol):
 
 
 @runtime_checkable
-class Powered(Protocol):
+class PoweredMode(Protocol):
     """Joints that have torque from a person's request until any safety condition fails."""
 
     @property
@@ -65,7 +65,7 @@ class Powered(Protocol):
 
 
 @runtime_checkable
-class Head(Powered, Protocol):
+class GazeMode(PoweredMode, Protocol):
     """A head that can be aimed."""
 
     @property
@@ -92,7 +92,7 @@ class Head(Powered, Protocol):
 
 
 @runtime_checkable
-class TellsHealth(Protocol):
+class ReportsHealth(Protocol):
     """A device that reports its health."""
 
     @property
@@ -105,7 +105,7 @@ class TellsHealth(Protocol):
 class JoinedHealth:
     """The health of several devices."""
 
-    devices: Sequence[TellsHealth]
+    devices: Sequence[ReportsHealth]
 
     @property
     def health(self) -> tuple[str, ...]:
@@ -124,26 +124,28 @@ class Sources:
     marker: MarkerSource
     clock: Clock
     simulation: GroundTruth | None = None
-    powered: tuple[Powered, ...] = ()  # drives that may move the arm or the head once a person asks for it
-    head: Head | None = None  # the one of them that moves the cameras
-    cameras: TellsHealth | None = None  # reports the health of the cameras or of other marker sources, if there are any
-    seen_by: str = THE_CAMERAS  # name of the marker source in messages
+    powered: tuple[PoweredMode, ...] = ()  # drives that may move the arm or the head once a person asks for it
+    head: GazeMode | None = None  # the one of them that moves the cameras
+    cameras: ReportsHealth | None = (
+        None  # reports the health of the cameras or of other marker sources, if there are any
+    )
+    marker_source_name: str = THE_CAMERAS  # name of the marker source in messages
     calibration: StereoCalibration | None = None  # the cameras' calibration, if it differs from [camera]
     # returns the newest camera picture as JPEG, or None before the first; None without cameras
     picture: Picture | None = None
     live: bool = False  # neither encoders nor cameras wait for the other; otherwise unread data is kept
 
 
-def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
+def find_powered(drives: Iterable[object], name: str, file: Path) -> PoweredMode:
     """Return the arm's drive of this name; raise ConfigError if robot.toml, `file`, does not configure it."""
     for drive in drives:
-        if isinstance(drive, Powered) and drive.name == name:
+        if isinstance(drive, PoweredMode) and drive.name == name:
             return drive
     remedy = f"Add the table [drivers.dynamixel.{name}]: docs/zero_force.md"
     raise ConfigError(f"{name} is not configured", file=file, remedy=remedy)
 
 
-def asked(drive: Powered, *, on: bool) -> str:
+def request_power(drive: PoweredMode, *, on: bool) -> str:
     """Send a request to the reading thread and wait for its answer; cancel it on a timeout.
 
     Raises:

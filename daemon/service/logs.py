@@ -48,9 +48,9 @@ class JournalFormatter(PlainFormatter):
 
 
 @dataclass(slots=True)
-class _Said:
+class _RepeatedMessage:
     since: float
-    most: int
+    limit: int
     count: int = 0
 
 
@@ -65,7 +65,7 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
         super().__init__(stream)
         self.setFormatter(formatter)
         self._now = now
-        self._said: OrderedDict[tuple[str, int, str], _Said] = OrderedDict()
+        self._recent: OrderedDict[tuple[str, int, str], _RepeatedMessage] = OrderedDict()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record, unless it is a repeat."""
@@ -80,34 +80,36 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
 
     def _is_new(self, record: logging.LogRecord) -> bool:
         text = record.getMessage()
-        alike = _NUMBER.sub("#", text)
-        if alike != text and (record.name, record.levelno, text) not in self._said:
-            said = self._entry(record, alike)
-            said.count += 1
-            if said.count > RepeatSettings.often:
+        pattern = _NUMBER.sub("#", text)
+        if pattern != text and (record.name, record.levelno, text) not in self._recent:
+            repeated = self._entry(record, pattern)
+            repeated.count += 1
+            if repeated.count > RepeatSettings.often:
                 return False
-        said = self._entry(record, text)
-        said.count += 1
-        return said.count == 1
+        repeated = self._entry(record, text)
+        repeated.count += 1
+        return repeated.count == 1
 
-    def _entry(self, record: logging.LogRecord, text: str) -> _Said:
+    def _entry(self, record: logging.LogRecord, text: str) -> _RepeatedMessage:
         key = (record.name, record.levelno, text)
-        if key not in self._said and len(self._said) >= RepeatSettings.remembered:
-            self._forget(next(iter(self._said)))
-        self._said.setdefault(key, _Said(self._now(), RepeatSettings.often if text != record.getMessage() else 1))
-        self._said.move_to_end(key)
-        return self._said[key]
+        if key not in self._recent and len(self._recent) >= RepeatSettings.remembered:
+            self._forget(next(iter(self._recent)))
+        self._recent.setdefault(
+            key, _RepeatedMessage(self._now(), RepeatSettings.often if text != record.getMessage() else 1)
+        )
+        self._recent.move_to_end(key)
+        return self._recent[key]
 
     def _forget_before(self, moment: float) -> None:
-        for key in [key for key, said in self._said.items() if said.since <= moment]:
+        for key in [key for key, repeated in self._recent.items() if repeated.since <= moment]:
             self._forget(key)
 
     def _forget(self, key: tuple[str, int, str]) -> None:
         name, level, text = key
-        said = self._said.pop(key)
-        if said.count > said.most:
-            again = f"{said.count - said.most} more times in {self._now() - said.since:.0f} s: {text}"
-            super().emit(logging.LogRecord(name, level, "", 0, again, None, None))
+        repeated = self._recent.pop(key)
+        if repeated.count > repeated.limit:
+            summary = f"{repeated.count - repeated.limit} more times in {self._now() - repeated.since:.0f} s: {text}"
+            super().emit(logging.LogRecord(name, level, "", 0, summary, None, None))
 
 
 def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ, stream: TextIO | None = None) -> None:

@@ -45,38 +45,38 @@ class Notifier:
         return cls(address, int(microseconds) / 1e6 if watched else None)
 
     @property
-    def is_heard(self) -> bool:
+    def is_connected(self) -> bool:
         """True if systemd started this process and listens."""
         return self._address is not None
 
     def ready(self) -> None:
         """Report that the start, or the reload after `reloading`, is complete."""
-        self._tell("READY=1")
+        self._send("READY=1")
 
     def starting(self) -> None:
         """Report progress of the start, as often as you like: systemd waits for `start_limit_s` from now."""
         now = time.monotonic()
         if now >= self._next_extension:
             self._next_extension = now + NotifySettings.extend_every_s
-            self._tell(f"EXTEND_TIMEOUT_USEC={NotifySettings.start_limit_s * 1_000_000}")
+            self._send(f"EXTEND_TIMEOUT_USEC={NotifySettings.start_limit_s * 1_000_000}")
 
     def reloading(self) -> None:
         """Report that the configuration is being read again; `ready` ends this."""
-        self._tell(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def stopping(self) -> None:
         """Report that the process is stopping."""
-        self._tell("STOPPING=1")
+        self._send("STOPPING=1")
 
     def status(self, line: str) -> None:
         """Send one line that `systemctl status` shows."""
-        self._tell(f"STATUS={' '.join(line.split())[: NotifySettings.longest_status]}")
+        self._send(f"STATUS={' '.join(line.split())[: NotifySettings.longest_status]}")
 
     def feed_watchdog(self) -> None:
         """Report that the process works."""
-        self._tell("WATCHDOG=1")
+        self._send("WATCHDOG=1")
 
-    def _tell(self, state: str) -> None:
+    def _send(self, state: str) -> None:
         if self._address is None:
             return
         try:

@@ -21,18 +21,18 @@ class Reload:
 
     config: Config  # the configuration in force from now on; unchanged if nothing changed that can
     changed: list[str]  # settings that take effect, as in `daemon.min_step_deg = 2.0`
-    waiting: list[str]  # settings that need a restart
+    needs_restart: list[str]  # settings that need a restart
 
     def message(self, process: str) -> str:
         """Return a summary, with the remedy."""
-        said = [f"in force now: {', '.join(self.changed)}"] if self.changed else []
-        if self.waiting:
+        parts = [f"in force now: {', '.join(self.changed)}"] if self.changed else []
+        if self.needs_restart:
             restart = f"systemctl restart bodyschema-{process}@{self.config.robot.name}"
-            said.append(
-                f"{', '.join(self.waiting)} cannot change while the {process} runs: restart it (`{restart}`, or "
+            parts.append(
+                f"{', '.join(self.needs_restart)} cannot change while the {process} runs: restart it (`{restart}`, or "
                 "Ctrl-C and again); no pair is lost by that"
             )
-        return ". ".join(said) or "nothing that the process knows of is other than it was"
+        return ". ".join(parts) or "nothing that the process knows of is other than it was"
 
 
 def reload(config: Config, tables: Collection[str], changeable: Collection[Key]) -> Reload:
@@ -46,26 +46,26 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
     Raises:
         ConfigError: robot.toml is invalid now; nothing changed.
     """
-    found = Config.load(config.file)
+    loaded = Config.load(config.file)
     if config.given_state_dir is not None:
-        found = found.with_state_dir(config.given_state_dir)
+        loaded = loaded.with_state_dir(config.given_state_dir)
     changed: list[str] = []
-    waiting: list[str] = []
-    taken: dict[str, msgspec.Struct] = {}
+    needs_restart: list[str] = []
+    updated: dict[str, msgspec.Struct] = {}
     for table in tables:
-        then, now = _table(config, table), _table(found, table)
+        then, now = _table(config, table), _table(loaded, table)
         for key in sorted(then.keys() | now.keys()):
             if then.get(key) == now.get(key):
                 continue
             if (table, key) in changeable:
                 changed.append(f"{table}.{key} = {msgspec.json.encode(now[key]).decode()}")
-                before: msgspec.Struct = taken.get(table) or getattr(config.tables, table)
-                taken[table] = msgspec.structs.replace(before, **{key: now[key]})
+                before: msgspec.Struct = updated.get(table) or getattr(config.tables, table)
+                updated[table] = msgspec.structs.replace(before, **{key: now[key]})
             else:
-                waiting.append(f"{table}.{key}".rstrip("."))
-    if not _same_arm(config, found):
-        waiting.append("the URDF")
-    return Reload(config.with_tables(msgspec.structs.replace(config.tables, **taken)), changed, waiting)
+                needs_restart.append(f"{table}.{key}".rstrip("."))
+    if not _same_arm(config, loaded):
+        needs_restart.append("the URDF")
+    return Reload(config.with_tables(msgspec.structs.replace(config.tables, **updated)), changed, needs_restart)
 
 
 def _table(config: Config, name: str) -> dict[str, Any]:

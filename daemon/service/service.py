@@ -38,7 +38,7 @@ class Service:
         may_open: Callable[[str], bool] = lambda device: os.access(device, os.R_OK | os.W_OK),
     ) -> None:
         """Start in the state "not ready"."""
-        self._devices = devices if notifier.is_heard else ()
+        self._devices = devices if notifier.is_connected else ()
         self._may_open, self._forbidden_since = may_open, math.inf
         self._notifier, self._clock = notifier, clock
         self._loops = set(loops)
@@ -47,10 +47,10 @@ class Service:
         self._next_feed = clock.now()
         self._lock = threading.Lock()
         self._ready = False
-        self._said = ""
+        self._last_status = ""
 
     @classmethod
-    def nobodys(cls, clock: Clock) -> Service:
+    def unsupervised(cls, clock: Clock) -> Service:
         """Return a service for a process that systemd did not start."""
         return cls(Notifier(), (), clock)
 
@@ -66,7 +66,7 @@ class Service:
                 self._next_feed = now + self._every_s
                 self._notifier.feed_watchdog()
 
-    def leave(self, loop: str) -> None:
+    def remove_loop(self, loop: str) -> None:
         """Note that the loop of this name has ended as intended: the watchdog no longer waits for it."""
         with self._lock:
             self._loops.discard(loop)
@@ -88,7 +88,7 @@ class Service:
         self._forbidden_since = math.inf if found is None else min(self._forbidden_since, now)
         return found if now - self._forbidden_since >= _Settings.settled_s else None
 
-    def follow(self, reload: Callable[[], str]) -> None:
+    def reload_and_report(self, reload: Callable[[], str]) -> None:
         """Report that robot.toml is read again by `reload`. Log its result, since a signal has no reply."""
         self._notifier.reloading()
         try:
@@ -98,10 +98,10 @@ class Service:
         finally:
             self._notifier.ready()
 
-    def tell(self, line: str) -> None:
+    def report_status(self, line: str) -> None:
         """Report the state of the process in one line."""
-        if line != self._said:
-            self._said = line
+        if line != self._last_status:
+            self._last_status = line
             self._notifier.status(line)
 
     def stopping(self) -> None:

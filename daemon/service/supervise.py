@@ -30,13 +30,13 @@ class Child:
         self.name = name
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
-        self._served = False
+        self._has_served = False
         self._pipe = -1
         self._started_at = 0.0
         self._start_at = 0.0
         self._wait_s = Waits.first_s
 
-    def tend(self) -> None:
+    def ensure_running(self) -> None:
         """Start the process if it is not running and its waiting time is over.
 
         Raises:
@@ -45,16 +45,16 @@ class Child:
         now = time.monotonic()
         if self._process is None:
             if now >= self._start_at:
-                self._process, self._pipe = self._started()
+                self._process, self._pipe = self._start()
                 self._started_at = now
             return
         if now - self._started_at > Waits.longest_s:
             self._wait_s = Waits.first_s
         code = self._process.poll()
         if code is not None:
-            self._served = self._served or _has_line(self._pipe)
+            self._has_served = self._has_served or _has_line(self._pipe)
             self._forget()
-            self._ended(code, now)
+            self._handle_exit(code, now)
 
     def end(self) -> None:
         """Request the end of the process."""
@@ -73,7 +73,7 @@ class Child:
             self._process.wait()
         self._forget()
 
-    def _started(self) -> tuple[subprocess.Popen[bytes], int]:
+    def _start(self) -> tuple[subprocess.Popen[bytes], int]:
         """Start the process; return it, and the pipe in which it reports that it works."""
         reading, writing = os.pipe()
         os.set_blocking(reading, False)
@@ -88,11 +88,11 @@ class Child:
         os.close(self._pipe)
         self._process = None
 
-    def _ended(self, code: int, now: float) -> None:
-        if code > 0 and not self._served:
+    def _handle_exit(self, code: int, now: float) -> None:
+        if code > 0 and not self._has_served:
             raise BodyschemaError(f"the {self.name} could not start (exit code {code}); its message is above")
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        log.error("the %s %s; starting it again in %g s", self.name, how, self._wait_s)
+        cause = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        log.error("the %s %s; starting it again in %g s", self.name, cause, self._wait_s)
         self._start_at = now + self._wait_s
         self._wait_s = min(2 * self._wait_s, Waits.longest_s)
 
@@ -124,7 +124,7 @@ class Supervisor:
         try:
             while not self._stopping:
                 for child in self._children:
-                    child.tend()
+                    child.ensure_running()
                 time.sleep(Waits.poll_s)
         finally:
             for child in self._children:

@@ -17,9 +17,9 @@ EVERY_ROBOT = "*"
 # The cache and the announcements of advanced publications use keys next to the published key, hidden from wild cards.
 CACHE = "@adv/**"
 
-Deed = Literal["says", "hears", "asks", "answers", "shows", "watches"]
+Action = Literal["says", "hears", "asks", "answers", "shows", "watches"]
 # For each action: the messages sent by the client that performs it, and the messages sent to that client.
-_MESSAGES: dict[Deed, tuple[tuple[str, ...], tuple[str, ...]]] = {
+_MESSAGES: dict[Action, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "says": (("put", "delete"), ("declare_subscriber",)),
     "hears": (("declare_subscriber",), ("put", "delete")),
     "asks": (("query",), ("reply", "declare_queryable")),
@@ -42,13 +42,13 @@ class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 ROLES = tuple(field.name for field in msgspec.structs.fields(Names))
 
 
-def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
+def allowed_actions(role: str, keys: Keys) -> dict[Action, tuple[str, ...]]:
     """Return the keys under which the role may perform each action."""
     pair, cache = keys.pair, f"{keys.pair}/{CACHE}"
     states, alive = (keys.status("sampler"), keys.status("learner")), (keys.alive("sampler"), keys.alive("learner"))
     questions = (keys.predict, keys.jacobian, keys.ik, keys.model)
     # A role that covers both processes may also use wild cards: status/*, alive/*.
-    views: dict[Deed, tuple[str, ...]] = {
+    views: dict[Action, tuple[str, ...]] = {
         "hears": (pair, keys.status("*")),
         "asks": (*questions, keys.pairs, keys.status("*"), pair, cache),
         "watches": (keys.alive("*"), cache),
@@ -92,18 +92,18 @@ def access_control(names_of_robot: Mapping[str, Names], *, by_user: bool) -> dic
             if not who:
                 continue
             identity = f"{role} of {robot}"
-            of_role = list(_rules(identity, deeds(role, Keys(robot))))
+            of_role = list(_rules(identity, allowed_actions(role, Keys(robot))))
             rules += of_role
             owners.append({"id": identity, kind: list(who)})
             policies.append({"rules": [rule["id"] for rule in of_role], "subjects": [identity]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": owners, "policies": policies}
 
 
-def _rules(identity: str, allowed: Mapping[Deed, tuple[str, ...]]) -> Iterator[dict[str, Any]]:
-    for deed, keys in allowed.items():
-        for flow, messages in zip(("ingress", "egress"), _MESSAGES[deed], strict=True):
+def _rules(identity: str, allowed: Mapping[Action, tuple[str, ...]]) -> Iterator[dict[str, Any]]:
+    for action, keys in allowed.items():
+        for flow, messages in zip(("ingress", "egress"), _MESSAGES[action], strict=True):
             yield {
-                "id": f"{identity} {deed} {flow}",
+                "id": f"{identity} {action} {flow}",
                 "messages": list(messages),
                 "flows": [flow],
                 "permission": "allow",

@@ -33,15 +33,15 @@ class Limits:
 
 
 LIMITS = Limits()
-EVERYBODYS = 8  # total over all sources, as a multiple of one source's limit
+TOTAL_RATIO = 8  # total over all sources, as a multiple of one source's limit
 
 
 @dataclass(slots=True)
 class _Source(Generic[T]):
     """One source: its waiting queries with arrival times and sizes, and its remaining allowance."""
 
-    left: float
-    seen: float
+    allowance: float
+    last_seen: float
     size: int = 0
     waiting: deque[tuple[float, int, T]] = field(default_factory=deque)
 
@@ -67,30 +67,30 @@ class QueryLimiter(Generic[T]):
         if size > limits.request_bytes:
             raise RequestError(f"the request has {size:,} bytes; send at most {limits.request_bytes:,}")
         with self._lock:
-            asking = self._asking(source)
-            if len(asking.waiting) >= limits.waiting:
+            state = self._source(source)
+            if len(state.waiting) >= limits.waiting:
                 raise RequestError(
-                    f"{limits.waiting} queries of {_named(source)} wait already, and that is the most; wait for an "
+                    f"{limits.waiting} queries of {_label(source)} wait already, and that is the most; wait for an "
                     "answer before asking more"
                 )
-            if asking.size + size > limits.waiting_bytes:
+            if state.size + size > limits.waiting_bytes:
                 raise RequestError(
-                    f"{asking.size:,} bytes of queries of {_named(source)} wait already, and {limits.waiting_bytes:,} "
+                    f"{state.size:,} bytes of queries of {_label(source)} wait already, and {limits.waiting_bytes:,} "
                     "are the most; wait for an answer before asking more"
                 )
-            if self._size + size > EVERYBODYS * limits.waiting_bytes:
+            if self._size + size > TOTAL_RATIO * limits.waiting_bytes:
                 raise RequestError(
-                    f"{self._size:,} bytes of queries wait already, and {EVERYBODYS * limits.waiting_bytes:,} are the "
+                    f"{self._size:,} bytes of queries wait already, and {TOTAL_RATIO * limits.waiting_bytes:,} are the "
                     "most; ask again later"
                 )
-            if asking.left < 1.0:
+            if state.allowance < 1.0:
                 raise RequestError(
-                    f"{_named(source)} asks too often; at most {limits.rate_hz:g} queries/s, {limits.burst} at once "
+                    f"{_label(source)} asks too often; at most {limits.rate_hz:g} queries/s, {limits.burst} at once "
                     "after a rest"
                 )
-            asking.left -= 1.0
-            asking.waiting.append((self._now(), size, query))
-            asking.size += size
+            state.allowance -= 1.0
+            state.waiting.append((self._now(), size, query))
+            state.size += size
             self._size += size
         self._turns.put(None)
 
@@ -98,46 +98,46 @@ class QueryLimiter(Generic[T]):
         """Return the next query, waiting for one, and the reason to refuse it, if any; None once closed."""
         self._turns.get()
         with self._lock:
-            name = next((name for name, asking in self._sources.items() if asking.waiting), None)
+            name = next((name for name, state in self._sources.items() if state.waiting), None)
             if name is None:
                 return None
-            asking = self._sources[name]
-            came, size, query = asking.waiting.popleft()
-            asking.size -= size
+            state = self._sources[name]
+            arrived_at, size, query = state.waiting.popleft()
+            state.size -= size
             self._size -= size
             self._sources.move_to_end(name)
-        waited, most = self._now() - came, self._limits.wait_s
-        if waited <= most:
+        waited, limit = self._now() - arrived_at, self._limits.wait_s
+        if waited <= limit:
             return query, None
-        return query, RequestError(f"the query waited {waited:.0f} s for its turn; at most {most:g} s")
+        return query, RequestError(f"the query waited {waited:.0f} s for its turn; at most {limit:g} s")
 
     def close(self) -> None:
         """Stop taking queries."""
         with self._lock:
-            for asking in self._sources.values():
-                asking.waiting.clear()
+            for state in self._sources.values():
+                state.waiting.clear()
         self._turns.put(None)
 
-    def _asking(self, source: str) -> _Source[T]:
+    def _source(self, source: str) -> _Source[T]:
         now, limits = self._now(), self._limits
-        asking = self._sources.get(source)
-        if asking is None:
+        state = self._sources.get(source)
+        if state is None:
             self._make_room()
-            asking = self._sources[source] = _Source(float(limits.burst), now)
+            state = self._sources[source] = _Source(float(limits.burst), now)
             self._sources.move_to_end(source, last=False)  # first come, first served
-        asking.left = min(float(limits.burst), asking.left + limits.rate_hz * (now - asking.seen))
-        asking.seen = now
-        return asking
+        state.allowance = min(float(limits.burst), state.allowance + limits.rate_hz * (now - state.last_seen))
+        state.last_seen = now
+        return state
 
     def _make_room(self) -> None:
         if len(self._sources) < self._limits.sources:
             return
-        resting = [name for name, asking in self._sources.items() if not asking.waiting]
-        if not resting:
+        idle = [name for name, state in self._sources.items() if not state.waiting]
+        if not idle:
             raise RequestError(f"{self._limits.sources} clients wait already, and that is the most; ask again later")
         # The source that rested longest loses the least state.
-        del self._sources[min(resting, key=lambda name: self._sources[name].seen)]
+        del self._sources[min(idle, key=lambda name: self._sources[name].last_seen)]
 
 
-def _named(source: str) -> str:
+def _label(source: str) -> str:
     return f"the source {source}" if source else "clients that give no source_info"

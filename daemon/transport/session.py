@@ -81,7 +81,7 @@ class ZenohSession:
         self._open_timeout_s = open_timeout_s
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []  # a token without a reference is undeclared
-        self._receptions: list[QueryLimiter[zenoh.Query]] = []
+        self._limiters: list[QueryLimiter[zenoh.Query]] = []
         self._threads: list[threading.Thread] = []
         self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(SessionSettings.most_refusals)
 
@@ -133,11 +133,11 @@ class ZenohSession:
             encoding: encoding of the answers; None: that of the request.
         """
 
-        reception: QueryLimiter[zenoh.Query] = QueryLimiter()
+        limiter: QueryLimiter[zenoh.Query] = QueryLimiter()
 
         def receive(query: zenoh.Query) -> None:
             try:
-                reception.admit(_source(query), 0 if query.payload is None else len(query.payload), query)
+                limiter.admit(_source(query), 0 if query.payload is None else len(query.payload), query)
             except RequestError as error:
                 try:
                     self._refusals.put_nowait((query, str(error)))
@@ -146,8 +146,8 @@ class ZenohSession:
 
         if not self._threads:
             self._start(self._refuse)
-        self._receptions.append(reception)
-        self._start(lambda: self._answer(key, reception, handler, encoding))
+        self._limiters.append(limiter)
+        self._start(lambda: self._answer(key, limiter, handler, encoding))
         # Runs in zenoh's own thread, which only queues the query.
         received = zenoh.handlers.Callback(receive, indirect=False)
         self._declared.append(self._open.declare_queryable(key, received, complete=True))
@@ -177,7 +177,7 @@ class ZenohSession:
         source = zenoh.SourceInfo(self._open.id, 0)
         said = zenoh.Encoding(encoding)
         replies = self._open.get(key, payload=payload, encoding=said, timeout=timeout_s, source_info=source)
-        return [_taken_apart(reply) for reply in replies]
+        return [_unpacked_reply(reply) for reply in replies]
 
     def ask_one(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> bytes:
         """Return the one reply to a query.
@@ -233,7 +233,7 @@ class ZenohSession:
 
     def _explain(self, message: str) -> str:
         if self._client and self._route is not None:
-            return unreached(self._route)
+            return unreachable(self._route)
         listen = self._listen or " or ".join(self._settings.get("listen/endpoints", ())) or "nothing"
         if "in use" in message:
             return (
@@ -249,13 +249,13 @@ class ZenohSession:
 
     def _end_threads(self) -> None:
         """End the handler threads after the session was closed and nothing more can arrive."""
-        for reception in self._receptions:
-            reception.close()
+        for limiter in self._limiters:
+            limiter.close()
         if self._threads:
             self._refusals.put(None)
         for thread in self._threads:
             thread.join()
-        self._receptions.clear()
+        self._limiters.clear()
         self._threads.clear()
 
     def _refuse(self) -> None:
@@ -266,9 +266,9 @@ class ZenohSession:
             del refused  # a query that is referenced is not yet answered
 
     def _answer(
-        self, key: str, reception: QueryLimiter[zenoh.Query], handler: Callable[[Request], bytes], encoding: str | None
+        self, key: str, limiter: QueryLimiter[zenoh.Query], handler: Callable[[Request], bytes], encoding: str | None
     ) -> None:
-        while (taken := reception.take()) is not None:
+        while (taken := limiter.take()) is not None:
             query, refused = taken
             with contextlib.suppress(zenoh.ZError), query:  # a closed session cannot answer
                 if refused is None:
@@ -331,7 +331,7 @@ def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = Sessi
         return False
 
 
-def _taken_apart(reply: zenoh.Reply) -> Reply:
+def _unpacked_reply(reply: zenoh.Reply) -> Reply:
     if reply.ok is not None:
         return Reply(reply.ok.payload.to_bytes(), None)
     assert reply.err is not None
@@ -344,7 +344,7 @@ def _taken_apart(reply: zenoh.Reply) -> Reply:
         return Reply(payload, payload.decode(errors="replace"))
 
 
-def unreached(route: Route) -> str:
+def unreachable(route: Route) -> str:
     """Return the reason why none of a route's endpoints could be reached."""
     last = route.endpoints[-1]
     if not accepts(last):

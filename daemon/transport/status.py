@@ -7,7 +7,7 @@ import math
 import msgspec
 
 from bodyschema.interfaces.servos import BusStatus, ServoStatus
-from bodyschema.learning.status import ChainCalibration, CurvePoint, OrientationStatus, Outlook
+from bodyschema.learning.status import ChainCalibration, CurvePoint, DataOutlook, OrientationStatus
 
 from .wire import SCHEMA
 
@@ -92,7 +92,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     model: str  # its hash; empty before the first
     # camera, tool and joint offsets; null before the first solution with the present tool
     calibration: ChainCalibration | None
-    outlook: Outlook | None  # expected gain of more data; null before such a solution
+    outlook: DataOutlook | None  # expected gain of more data; null before such a solution
     gaps_recovered: int  # pairs fetched from the sampler's history
     refused: int  # unusable pairs
     doubted: int  # suspected outliers

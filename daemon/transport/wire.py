@@ -210,7 +210,7 @@ def _as_message(pair: Pair, pose: MarkerPose) -> PairMessage:
         q=pair.q.tolist(),
         x=(x, y, z),
         cov=upper_triangle(pair.cov),
-        R=None if pair.R is None else _four(pair.R),
+        R=None if pair.R is None else _quaternion(pair.R),
         cov_R=None if pair.cov_R is None else upper_triangle(pair.cov_R),
         pose=pose,
     )
@@ -250,7 +250,7 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
     )
 
 
-def _four(turn: FloatArray) -> tuple[float, float, float, float]:
+def _quaternion(turn: FloatArray) -> tuple[float, float, float, float]:
     x, y, z, w = turn.tolist()
     return x, y, z, w
 

@@ -19,7 +19,7 @@ import msgspec
 from bodyschema.daemon.config import Config
 from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.bench.dry_run import BenchArm, DryRun
-from bodyschema.drivers.bench.faults import AskedFault
+from bodyschema.drivers.bench.faults import FaultSpec
 from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver, ThroughDriverSettings
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
@@ -31,7 +31,7 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.extras import install_command, no_pybullet
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading
-from bodyschema.interfaces.whole_files import writing
+from bodyschema.interfaces.whole_files import raising_write_errors
 from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.robot.toml_text import toml_text
@@ -112,7 +112,7 @@ def open_bench(
     """
     hardware = require_on_ports(config)
     make = _arm_of(hardware)
-    asked = [AskedFault.parsed(text, config.robot.joints, make.kinds) for text in faults]
+    asked = [FaultSpec.parsed(text, config.robot.joints, make.kinds) for text in faults]
     if not isinstance(hardware, SerialLinesConfig):
         make = partial(make, return_delay_s=return_delay_s)
     arm = make(hardware, motion.angles, faults=asked, seed=seed)
@@ -188,7 +188,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     tables.setdefault("daemon", {})["state_dir"] = str(port.with_name(f"{port.name}.state").absolute())
     if "unexplained" in tables:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())
-    with writing(file, remedy="Give another --port"):
+    with raising_write_errors(file, remedy="Give another --port"):
         if file.exists() and not read_at_most(file).startswith(MARK.encode()):
             raise ConfigError("is there already, and no bench wrote it", file=file, remedy="Give another --port")
         file.write_text(f"{MARK}\n{toml_text(tables)}", encoding="utf-8")

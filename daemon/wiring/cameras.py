@@ -19,11 +19,11 @@ from bodyschema.interfaces.extras import require_extra
 from bodyschema.interfaces.protocols import Clock, StereoCamera
 from bodyschema.robot.toml_file import line_of, read_toml
 from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, RealsenseConfig, UvcSettings, VideosConfig
-from bodyschema.vision.cameras.film import Film
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.live import CameraFigures, LiveEyes
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.realsense import RealsenseCamera
+from bodyschema.vision.cameras.recorded_eyes import RecordedEyes
 from bodyschema.vision.cameras.v4l2.controls import left_to_the_camera
 from bodyschema.vision.cameras.v4l2.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
@@ -42,7 +42,7 @@ class _Settings:
 
 PAGE = "docs/cameras.md"
 
-Eyes = LiveEyes | RealsenseCamera | Film
+Eyes = LiveEyes | RealsenseCamera | RecordedEyes
 
 
 def require_cameras(config: Config) -> CamerasConfig:
@@ -106,7 +106,7 @@ def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
     cameras = require_cameras(config)
     if cameras.calibration is not None:
         rig = read_rig(calibration_file(config))
-        return RectifiedCamera(eyes, _of_files(rig, cameras) if isinstance(eyes, Film) else rig)
+        return RectifiedCamera(eyes, _of_files(rig, cameras) if isinstance(eyes, RecordedEyes) else rig)
     if isinstance(eyes, RealsenseCamera):
         return eyes
     if config.robot.calibration is None:
@@ -248,7 +248,7 @@ def _open_checks(eyes: Eyes, cameras: CamerasConfig) -> Iterator[Check]:
             frame = eyes.read(_Settings.read_s)
             if frame is not None:
                 frames, sigma_s = frames + 1, frame.t_sigma
-            if isinstance(eyes, Film):
+            if isinstance(eyes, RecordedEyes):
                 break
         width, height = eyes.image_size_px
         said = f"{' and '.join(serials)}: {width}x{height} pixels, time known to {1e3 * sigma_s:.0f} ms"
@@ -259,7 +259,7 @@ def _open_checks(eyes: Eyes, cameras: CamerasConfig) -> Iterator[Check]:
 
 def _live_checks(eyes: LiveEyes, cameras: CamerasConfig) -> Iterator[Check]:
     for figures in eyes.figures:
-        yield Check(figures.name, "ok", _told(figures))
+        yield Check(figures.name, "ok", _stream_sentences(figures))
     for complaint in eyes.health:
         what, _, remedy = complaint.partition(": ")
         yield Check("cameras", "warning", what, remedy)
@@ -273,7 +273,7 @@ def _live_checks(eyes: LiveEyes, cameras: CamerasConfig) -> Iterator[Check]:
         yield Check("cameras", "warning", said, "bodyschema calibrate latency")
 
 
-def _told(figures: CameraFigures) -> str:
+def _stream_sentences(figures: CameraFigures) -> str:
     rate = "" if figures.fps is None else f", {figures.fps:.1f} frames/s"
     stamps = "" if figures.stamps is None else f", dated by the {'kernel' if figures.stamps == 'kernel' else 'arrival'}"
     torn = f", {figures.damaged} damaged" if figures.damaged else ""

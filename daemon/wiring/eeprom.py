@@ -18,7 +18,7 @@ from bodyschema.drivers.servos.config import ServoConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
-from bodyschema.drivers.servos.workbench import Change, Done, EepromEditor, Outcome
+from bodyschema.drivers.servos.workbench import Change, EepromEditor, Outcome, WriteResult
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.robot.suggest import did_you_mean
@@ -28,12 +28,12 @@ __all__ = [
     "HOMING_OFFSET",
     "ID",
     "Change",
-    "Done",
     "EepromEditor",
     "IdentifiedServo",
     "Outcome",
+    "SelectedServo",
     "Setting",
-    "Wanted",
+    "WriteResult",
     "configured",
     "entry_of",
     "model_called",
@@ -51,7 +51,7 @@ EEPROM_VENDORS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class SelectedServo:
     """A selected servo, before it is queried."""
 
     table: str  # its vendor's table in [drivers]
@@ -61,7 +61,7 @@ class Wanted:
     model: Model
 
 
-def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[Wanted]:
+def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[SelectedServo]:
     """Return the servos of robot.toml that move `joints`, or all of a bus; all servos if neither is given.
 
     Raises:
@@ -81,19 +81,19 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[W
         name = servos.bus_of(entry)
         if (not joints or entry.joint in joints) and bus in (None, name):
             place = servos.buses[name]
-            found.append(Wanted(table, place.port, place.baud, entry, servos.model_of(entry)))
+            found.append(SelectedServo(table, place.port, place.baud, entry, servos.model_of(entry)))
     if not found:
         raise ConfigError(f"none of these joints is on the bus {bus!r}", file=config.file, remedy="Drop --bus")
     return found
 
 
-def stranger(port: str, baud: int, id: int) -> Wanted:
+def stranger(port: str, baud: int, id: int) -> SelectedServo:
     """Return the servo with an ID that robot.toml does not name, of any vendor; raise SourceError without an answer."""
     for table in [table for table, (_, _, bauds) in EEPROM_VENDORS.items() if baud in bauds]:
         with workbench_of(table) as workbench:
             model = workbench.model_at(workbench.bus(port, baud), id)
         if model is not None:
-            return Wanted(table, port, baud, entry_of(STRANGER, id, model), model)
+            return SelectedServo(table, port, baud, entry_of(STRANGER, id, model), model)
     raise SourceError(
         f"no servo that we know answers to ID {id} on {port} at {baud:,} bit/s. "
         f"`bodyschema scan --port {port}` looks at all rates"

@@ -81,7 +81,7 @@ _SIDE = re.compile(r"(\d{1,9})=(\d{1,9}\.?\d*)")
 
 
 @dataclass(frozen=True)
-class Wanted:
+class TagSelection:
     """Tags of a cluster: dictionary, IDs (None: all) and sides of the black squares [m], exceptions by ID."""
 
     dictionary: Dictionary
@@ -117,7 +117,7 @@ class ClusterFile(msgspec.Struct):
     tags: list[TagFigures]
 
 
-def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[str], None]) -> MeasuredCluster:
+def measured(images: Images, calibration: Path, wanted: TagSelection, tell: Callable[[str], None]) -> MeasuredCluster:
     """Measure the poses of the tags in images of calibrated cameras.
 
     Raises:
@@ -167,7 +167,7 @@ def _seen(finder: TagFinder, image: ImageArray, maps: tuple[ImageArray, ImageArr
     return finder.find(np.asarray(cv2.cvtColor(rectified, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
 
 
-def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str]], wanted: Wanted) -> None:
+def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str]], wanted: TagSelection) -> None:
     """Raise CalibrationError if several images show one ID twice, no tag is found, or a wanted one is missing."""
     for id, names in twice.items():
         if len(names) > 1:
@@ -186,7 +186,7 @@ def _require_tags(views: Sequence[ClusterView], twice: Mapping[int, Sequence[str
         )
 
 
-def tables(found: MeasuredCluster, wanted: Wanted) -> str:
+def tables(found: MeasuredCluster, wanted: TagSelection) -> str:
     """Return the tables for robot.toml, with the uncertainty of each tag in a comment."""
     notes = [
         "the marker's frame"

@@ -63,11 +63,11 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
     """Raise ConfigError if the tracker does not find the marker even alone in front of a plain wall."""
-    from bodyschema.sim_backend.rendering.eye import portraits
+    from bodyschema.sim_backend.rendering.eye import ball_portraits
     from bodyschema.vision.trackers import tracker_of
 
     tracker, reasons = tracker_of(calibration, config.tables.vision), []
-    for t, images in enumerate(portraits(calibration, camera)):
+    for t, images in enumerate(ball_portraits(calibration, camera)):
         seen = tracker.track(StereoFrame(_Settings.apart_s * t, images[0], images[1] if len(images) > 1 else None))
         if isinstance(seen, MarkerFix):
             return

@@ -14,14 +14,14 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.sampler.sources import (
     THE_CAMERAS,
-    Head,
+    GazeMode,
     JoinedHealth,
     MarkerTopic,
     Picture,
-    Powered,
+    PoweredMode,
+    ReportsHealth,
     Sources,
     StampedJoints,
-    TellsHealth,
 )
 from bodyschema.daemon.wiring.bench import require_bench, through_bench
 from bodyschema.daemon.wiring.simulation import simulation_settings
@@ -75,10 +75,14 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
     _require_source(config, sim=sim)
     recording = config.tables.drivers.recording
     if sim:
-        with _simulated(config) as sources:
+        with _simulated_sources(config) as sources:
             yield sources
     else:
-        yield _real(config) if recording is None else _recorded(config, config.file.parent / recording)
+        yield (
+            _hardware_sources(config)
+            if recording is None
+            else _recorded_sources(config, config.file.parent / recording)
+        )
 
 
 def check_sources(config: Config, *, sim: bool) -> None:
@@ -203,7 +207,7 @@ def demonstration_model() -> Path:
     return model_file("upper_body")
 
 
-def _real(config: Config) -> Sources:
+def _hardware_sources(config: Config) -> Sources:
     clock = SystemClock()
     joints = open_joints(config, clock)
     marker, health, calibration, picture = _open_marker(config, clock)
@@ -212,10 +216,10 @@ def _real(config: Config) -> Sources:
         joints,
         marker,
         clock,
-        powered=tuple(drive for drive in drives if isinstance(drive, Powered)),
-        head=next((drive for drive in drives if isinstance(drive, Head)), None),
+        powered=tuple(drive for drive in drives if isinstance(drive, PoweredMode)),
+        head=next((drive for drive in drives if isinstance(drive, GazeMode)), None),
         cameras=health,
-        seen_by=_seen_by(config),
+        marker_source_name=_name_of_marker_source(config),
         calibration=calibration,
         picture=picture,
         live=True,
@@ -224,7 +228,7 @@ def _real(config: Config) -> Sources:
 
 def _open_marker(
     config: Config, clock: Clock
-) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None, Picture | None]:
+) -> tuple[MarkerSource, ReportsHealth, StereoCalibration | None, Picture | None]:
     """Return the marker source, not opened yet, its health, and the calibration and picture of the cameras."""
     tables = config.tables.marker_source
     streams = [stream_of(table, clock) for table in tables]
@@ -232,7 +236,7 @@ def _open_marker(
         return streams[0], streams[0], None, None
     members = [Member(table.label, stream, table.pose) for table, stream in zip(tables, streams, strict=True)]
     calibration = picture = None
-    healths: list[TellsHealth] = [*streams]
+    healths: list[ReportsHealth] = [*streams]
     if config.tables.vision.cameras is not None:
         from .cameras import seen_through
 
@@ -253,7 +257,7 @@ def _open_marker(
     return fused, JoinedHealth([fused, *healths]), calibration, picture
 
 
-def _seen_by(config: Config) -> str:
+def _name_of_marker_source(config: Config) -> str:
     """Return the name of the marker source in messages."""
     tables = config.tables
     names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
@@ -264,7 +268,7 @@ def _seen_by(config: Config) -> str:
     return f"the positions by {' and '.join(names)}"
 
 
-def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration, Picture]:
+def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, ReportsHealth, StereoCalibration, Picture]:
     """Return the cameras of robot.toml with their tracker, not opened yet, their health, calibration and picture."""
     from bodyschema.vision.cameras.depth_check import DepthChecked
     from bodyschema.vision.cameras.realsense import RealsenseCamera
@@ -326,7 +330,7 @@ def marker_source_lines(config: Config) -> Iterator[str]:
 
 
 @contextmanager
-def _simulated(config: Config) -> Iterator[Sources]:
+def _simulated_sources(config: Config) -> Iterator[Sources]:
     require_extra("sim", "the simulation")
     from bodyschema.sim_backend import SimWorld
     from bodyschema.sim_backend.world import exact_encoders
@@ -367,7 +371,7 @@ def simulated_truth(config: Config) -> RigidChain:
     return true_chain(config.robot, config.tables.sim, extension=config.simulation)
 
 
-def _recorded(config: Config, file: Path) -> Sources:
+def _recorded_sources(config: Config, file: Path) -> Sources:
     from bodyschema.drivers.replay import Replay
     from bodyschema.recordings.recording import Recording
 

@@ -33,7 +33,7 @@ def shares(aligned: Fit, extended: Fit, kept: NDArray[np.bool_], unnamed: FloatA
         unnamed: change (n, 3) [m] by the smooth model of unnamed causes; None without one.
     """
     simulation, motion = extended.simulation, extended.observations.motion
-    left = _beside_nuisances(extended, (extended.observations.x - aligned.predicted)[kept], kept)
+    residuals = _without_nuisances(extended, (extended.observations.x - aligned.predicted)[kept], kept)
     whole = simulation.positions(motion)
     # Initial tolerances of the simulation are not part of the findings.
     given = aligned.simulation.background
@@ -48,16 +48,16 @@ def shares(aligned: Fit, extended: Fit, kept: NDArray[np.bool_], unnamed: FloatA
     if unnamed is not None:
         changes.append(unnamed)
     # A part that only undoes another explains nothing.
-    explained = np.maximum([float((change[kept] * left).sum()) for change in changes], 0.0)
+    explained = np.maximum([float((change[kept] * residuals).sum()) for change in changes], 0.0)
     parts = (explained / max(float(explained.sum()), 1e-300)).tolist()
     count = len(extended.causes)
     return Shares(tuple(parts[:count]), parts[count], parts[count + 1])
 
 
-def _beside_nuisances(fit: Fit, left: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
+def _without_nuisances(fit: Fit, residuals: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
     """Return the part of residuals (m, 3) that parameters unknown to robot.toml cannot follow."""
-    columns = amount_columns(fit.run, fit.simulation.effects[: fit.nuisances])[kept].reshape(left.size, -1)
+    columns = amount_columns(fit.run, fit.simulation.effects[: fit.nuisances])[kept].reshape(residuals.size, -1)
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     basis = np.linalg.qr(columns)[0]
-    flat = left.ravel()
-    return (flat - basis @ (basis.T @ flat)).reshape(left.shape)
+    flat = residuals.ravel()
+    return (flat - basis @ (basis.T @ flat)).reshape(residuals.shape)

@@ -13,7 +13,7 @@ from bodyschema.diagnosis.fit.background import Background
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel
-from bodyschema.effects import Effect, Motion, Simulated
+from bodyschema.effects import Effect, Motion, PipelineRun
 from bodyschema.effects.motion import crossed
 from bodyschema.interfaces.records import FloatArray
 
@@ -36,7 +36,7 @@ def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
         candidates: fits of the same observations, the simplest first.
         markers: True for fixes (n,) that are probably the marker.
     """
-    best, *others = (_Elsewhere.of(fit, markers) for fit in candidates)
+    best, *others = (_Generalisation.of(fit, markers) for fit in candidates)
     for other in others:
         if other.is_better_than(best):
             best = other
@@ -49,14 +49,14 @@ def is_better_with(model: SmoothModel, simpler: Fit, markers: NDArray[np.bool_],
     Args:
         blocks: blocks held out from the functions of the model.
     """
-    before, after = _Elsewhere.of(simpler, markers), _Elsewhere.of(model.fit, markers)
-    left = model.fit.observations.x - model.fit.predicted + model.unseen
+    before, after = _Generalisation.of(simpler, markers), _Generalisation.of(model.fit, markers)
+    left = model.fit.observations.x - model.fit.predicted + model.in_sample_change
     gains = _sums(held_out_errors(simpler, blocks), markers) - _sums(left, markers)
     return replace(after, squares=before.squares - gains).is_better_than(before)
 
 
 @dataclass(frozen=True, eq=False)
-class _Elsewhere:
+class _Generalisation:
     """Expected errors of a fit on another recording."""
 
     fit: Fit
@@ -64,37 +64,37 @@ class _Elsewhere:
     variance: float  # mean squared distance between its predictions of new poses [m²]
 
     @classmethod
-    def of(cls, fit: Fit, markers: NDArray[np.bool_]) -> _Elsewhere:
+    def of(cls, fit: Fit, markers: NDArray[np.bool_]) -> _Generalisation:
         errors = fit.observations.x - fit.predicted
         if not len(fit.precision):
             return cls(fit, _sums(errors, markers), 0.0)
-        parts, columns, here = _long_blocks(len(errors)).of_row, fit.columns, fit.run_columns
-        flat, left = columns.reshape(fit.left.size, -1), fit.left.ravel()
-        whole = fit.observations.whole
-        free = whole.whitened(here[:, :, : fit.amounts]) * fit.root_weights[:, :, None]
+        parts, columns, here = _long_blocks(len(errors)).of_row, fit.columns, fit.derivatives
+        flat, left = columns.reshape(fit.weighted_residuals.size, -1), fit.weighted_residuals.ravel()
+        without_history = fit.observations.without_history
+        free = without_history.whitened(here[:, :, : fit.amounts]) * fit.root_weights[:, :, None]
         normal = flat.T @ flat + np.diag(fit.precision) * fit.noise.sigma**2
         gradient, changes = flat.T @ left, []
         for part in np.unique(parts):
             own = parts == part
             rows = columns[own].reshape(-1, columns.shape[2])
-            change = solved(normal - rows.T @ rows, gradient - rows.T @ fit.left[own].ravel())
-            if fit.observations.rattling is not None:
+            change = solved(normal - rows.T @ rows, gradient - rows.T @ fit.weighted_residuals[own].ravel())
+            if fit.observations.play_covariance is not None:
                 # As stored: both sides of the play determine the place.
-                missed = (whole.residuals(fit.predicted + here @ change) * fit.root_weights)[~own].ravel()
+                missed = (without_history.residuals(fit.predicted + here @ change) * fit.root_weights)[~own].ravel()
                 rest = free[~own].reshape(len(missed), fit.amounts)
                 change[: fit.amounts] += solved(rest.T @ rest, rest.T @ missed)
             errors[own] -= here[own] @ change
             changes.append(change)
-        elsewhere = _columns(fit, fit.settled_simulation.run(_new_poses(fit.observations.motion)))
+        elsewhere = _columns(fit, fit.simulation_with_tolerances.run(_new_poses(fit.observations.motion)))
         moved = elsewhere @ np.transpose(changes - np.mean(changes, axis=0))
         variance = (1.0 - 1.0 / len(changes)) * float(np.square(moved).sum(axis=(1, 2)).mean())
         return cls(fit, _sums(errors, markers), variance)
 
-    def is_better_than(self, simpler: _Elsewhere) -> bool:
+    def is_better_than(self, simpler: _Generalisation) -> bool:
         """Return True if this fit is surely better elsewhere."""
         gains = simpler.squares - self.squares
-        unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _Settings.surely)
-        return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)
+        margin = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _Settings.surely)
+        return float(gains.sum()) - margin > max(self.variance - simpler.variance, 0.0)
 
 
 def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
@@ -107,12 +107,12 @@ def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
         return None
     motion = fit.observations.motion
     motion = motion.some(np.arange(0, len(motion), -(-len(motion) // _Settings.poses)))
-    simulation = fit.settled_simulation
+    simulation = fit.simulation_with_tolerances
     own = [effect for effect in simulation.effects if _is_of_pose(effect)]
     arm = replace(simulation, effects=tuple(own), residual=None)
     # The marker, and points 1 m from it along the axes of its link, which rotate about it.
-    beside = [Effect.at(arm.robot, "tool_offset", values=axis) for axis in np.eye(3)]
-    marker, *points = (arm.with_effects([*own, *more]).run(motion) for more in ([], *([one] for one in beside)))
+    offset_points = [Effect.at(arm.robot, "tool_offset", values=axis) for axis in np.eye(3)]
+    marker, *points = (arm.with_effects([*own, *more]).run(motion) for more in ([], *([one] for one in offset_points)))
     moved = _pose_columns(fit, marker)
     turned = 0.5 * sum(
         crossed((point.measured - marker.measured)[:, :, None], _pose_columns(fit, point) - moved) for point in points
@@ -128,13 +128,15 @@ def _is_of_pose(effect: Effect) -> bool:
     return not effect.kind.drifts
 
 
-def _pose_columns(fit: Fit, run: Simulated) -> FloatArray:
+def _pose_columns(fit: Fit, run: PipelineRun) -> FloatArray:
     """Return derivatives (n, 3, p) [m] of a run in the order of `Fit.covariance`; 0 for effects that it lacks."""
     columns = [_columns(fit, run), *(run.by_shape(effect) for effect in fit.causes if effect.shapes)]
     numbers = [(effect, len(effect.amounts)) for effect in fit.simulation.effects]
     numbers += [(effect, len(effect.shapes)) for effect in fit.causes]
     counted = np.array([_is_of_pose(effect) for effect, count in numbers for _ in range(count)], dtype=bool)
-    return np.concatenate(columns, axis=2) * np.insert(counted, fit.amounts, np.ones(len(fit.tolerated), dtype=bool))
+    return np.concatenate(columns, axis=2) * np.insert(
+        counted, fit.amounts, np.ones(len(fit.tolerance_amounts), dtype=bool)
+    )
 
 
 def _long_blocks(rows: int) -> Blocks:
@@ -154,7 +156,7 @@ def _new_poses(motion: Motion) -> Motion:
     return replace(motion, q=q, t=None if motion.t is None else motion.t[rows], segment=motion.segment[rows])
 
 
-def _columns(fit: Fit, run: Simulated) -> FloatArray:
-    """Return derivatives (n, 3, p) [m] of a run on another motion, in the order of `run_columns`."""
+def _columns(fit: Fit, run: PipelineRun) -> FloatArray:
+    """Return derivatives (n, 3, p) [m] of a run on another motion, in the order of `derivatives`."""
     background = Background(run, fit.observations.whitening, fit.background.scales)
     return np.concatenate([amount_columns(run, fit.simulation.effects), background.columns], axis=2)

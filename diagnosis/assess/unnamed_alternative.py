@@ -9,11 +9,11 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns
 from bodyschema.diagnosis.search.search import Search
-from bodyschema.diagnosis.unnamed.family_fits import Apart, FamilySettings, UnnamedFamilies
+from bodyschema.diagnosis.unnamed.family_fits import FamilySettings, FitWithDiscrepancy, UnnamedFamilies
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
-from .explanation import cost_of_names
+from .explanation import naming_cost
 
 # Prior penalty against a named cause [nats]. Accepting one in place of a cause takes `specific_nats` instead, so that a
 # cause is not given up for something that fits as well by chance.
@@ -24,12 +24,12 @@ _LESS_USUAL = 1.5
 class UnnamedAlternative:
     """Alternative to a named cause: an unnamed one that is as specific, together with the other causes."""
 
-    apart: Apart  # the other causes, with the unnamed one removed from the data
-    behind: float  # its log-evidence relative to the cause that it replaces [nats]
+    discrepancy_fit: FitWithDiscrepancy  # the other causes, with the unnamed one removed from the data
+    relative_evidence: float  # its log-evidence relative to the cause that it replaces [nats]
 
     @classmethod
     def in_place_of(
-        cls, cause: Effect, fit: Fit, tried: Iterable[Apart], unnamed: UnnamedFamilies, search: Search
+        cls, cause: Effect, fit: Fit, tried: Iterable[FitWithDiscrepancy], unnamed: UnnamedFamilies, search: Search
     ) -> UnnamedAlternative | None:
         """Return the most probable one; None if there is none to test.
 
@@ -37,34 +37,39 @@ class UnnamedAlternative:
             fit: the fit with the cause.
             tried: fits without the cause, beside unnamed causes.
         """
-        allowance = cost_of_names([cause], search) + FamilySettings.specific_nats - _LESS_USUAL
+        allowance = naming_cost([cause], search) + FamilySettings.specific_nats - _LESS_USUAL
         found = [
-            cls(apart, apart.fit.log_likelihood - fit.log_likelihood + allowance - unnamed.cost(apart))
-            for apart in tried
+            cls(
+                discrepancy_fit,
+                discrepancy_fit.fit.log_likelihood - fit.log_likelihood + allowance - unnamed.cost(discrepancy_fit),
+            )
+            for discrepancy_fit in tried
         ]
-        return max(found, key=lambda one: one.behind, default=None)
+        return max(found, key=lambda one: one.relative_evidence, default=None)
 
     @property
     def kind(self) -> str:
         """Source of the error: a joint, a body, or the place in the image."""
-        return self.apart.chosen[0].family.kind
+        return self.discrepancy_fit.chosen[0].family.kind
 
     @property
     def what(self) -> str:
-        return self.apart.chosen[0].family.what
+        return self.discrepancy_fit.chosen[0].family.what
 
     @property
     def predicted(self) -> FloatArray:
         """Predicted measurements (n, 3) [m]."""
-        return self.apart.predicted
+        return self.discrepancy_fit.predicted
 
     def positions(self, motion: Motion) -> FloatArray:
         """Return the predicted measurements (n, 3) [m] on another motion."""
-        run = self.apart.fit.simulation.run(motion)
-        (way,), (numbers,) = self.apart.chosen, self.apart.numbers
-        return run.measured + way.family.columns(run) @ numbers
+        run = self.discrepancy_fit.fit.simulation.run(motion)
+        (prepared,), (numbers,) = self.discrepancy_fit.chosen, self.discrepancy_fit.numbers
+        return run.measured + prepared.family.columns(run) @ numbers
 
     def columns(self, motion: Motion) -> FloatArray:
         """Return derivatives (n, 3, p) [m] by the amounts of the causes and by its own parameters."""
-        run, (way,) = self.apart.fit.simulation.run(motion), self.apart.chosen
-        return np.concatenate([amount_columns(run, self.apart.fit.simulation.effects), way.family.columns(run)], axis=2)
+        run, (prepared,) = self.discrepancy_fit.fit.simulation.run(motion), self.discrepancy_fit.chosen
+        return np.concatenate(
+            [amount_columns(run, self.discrepancy_fit.fit.simulation.effects), prepared.family.columns(run)], axis=2
+        )

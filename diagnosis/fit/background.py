@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects import Effect, Simulated, Simulation
+from bodyschema.effects import Effect, PipelineRun, Simulation
 from bodyschema.interfaces.records import FloatArray
 
 
@@ -37,17 +37,17 @@ class Scales(NamedTuple):
     slides: float = 1.0
 
     @property
-    def no_larger(self) -> Scales:
+    def limited_to_workshop(self) -> Scales:
         """Return these scales, each limited to 1 (a workshop's tolerance)."""
         return Scales(*np.minimum(self, 1.0).tolist())
 
     @property
-    def several_times(self) -> float:
+    def excess_over_workshop(self) -> float:
         """Logarithm of the larger scale of lengths and angles, clipped to 0 (a workshop's) and 1 (e times that)."""
         return float(np.clip(np.log(self[:2]), 0.0, 1.0).max())
 
     @property
-    def doubt(self) -> float:
+    def prior_penalty(self) -> float:
         """Penalty of these scales under their prior, relative to a scale of 1; 0 for an exact arm [nats]."""
         if max(self) <= BackgroundSettings.smallest_scale:
             return 0.0
@@ -66,7 +66,7 @@ class Background:
     """
 
     def __init__(
-        self, run: Simulated, whitening: FloatArray, scales: Scales | None, before: Background | None = None
+        self, run: PipelineRun, whitening: FloatArray, scales: Scales | None, before: Background | None = None
     ) -> None:
         simulation = run.simulation
         self._whitening, self.scales = whitening, scales
@@ -105,7 +105,7 @@ class Background:
         given = self.with_amounts(np.zeros_like(self.start))
         return given if self._centre.any() else ()
 
-    def tolerates(self, effect: Effect) -> bool:
+    def is_within_tolerance(self, effect: Effect) -> bool:
         """Return True if an effect is a periodic drive error no larger than those of other drives."""
         if self.scales is None or not effect.kind.of_drive:
             return False
@@ -128,7 +128,7 @@ class Background:
 
     def inner(self, weights: FloatArray) -> FloatArray:
         """Return the products (p, p) of the whitened columns, rows weighted (n,)."""
-        partly = rows_in_part(weights)
+        partly = partially_weighted_rows(weights)
         rows = self.white.reshape(len(weights), -1)[partly] * np.sqrt(1.0 - weights[partly])[:, None]
         flat = rows.reshape(3 * len(partly), self.white.shape[1])
         return self._inner - flat.T @ flat
@@ -138,16 +138,16 @@ class Background:
         """Squared lengths (p,) of the background's changes, in units of the stated noise."""
         return np.maximum(np.linalg.eigvalsh(self._inner * np.outer(self.tolerances, self.tolerances)), 0.0)
 
-    def spent(self, sigma: float) -> float:
+    def effective_dof(self, sigma: float) -> float:
         """Return the effective number of parameters of the background for noise `sigma` times the stated one."""
         return float((self.spectrum / (self.spectrum + sigma**2)).sum())
 
-    def volume(self, sigma: float) -> float:
+    def occam_cost(self, sigma: float) -> float:
         """Return the Occam cost of the background's free parameters [nats]."""
         return float(0.5 * np.log1p(self.spectrum / sigma**2).sum())
 
 
-def rows_in_part(weights: FloatArray) -> NDArray[np.intp]:
+def partially_weighted_rows(weights: FloatArray) -> NDArray[np.intp]:
     """Return the rows whose weights (n,) are below 1: only these need to be visited again by weighted products."""
     return np.flatnonzero(1.0 - weights > BackgroundSettings.counts_in_full)
 
@@ -161,7 +161,7 @@ def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, .
             found.append(Effect.at(robot, "joint_eccentricity", joint))
             # Periodic errors of every drive: once and twice per turn of the joint.
             found.append(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, 2.0]))
-    return tuple(effect.with_amounts(0.0).one_more(-1) for effect in found)
+    return tuple(effect.with_amounts(0.0).with_ordinal(-1) for effect in found)
 
 
 def _groups(effect: Effect) -> np.ndarray:

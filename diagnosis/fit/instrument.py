@@ -27,12 +27,12 @@ def reshaped(fit: Fit) -> Observations | None:
     if np.allclose(variances[:, 0], variances[:, 2]):
         # No shape is stated, and few rows with many parameters do not determine one.
         return None
-    left = np.einsum("nji,nj->ni", axes, observations.x - fit.predicted)[rows]
+    residuals = np.einsum("nji,nj->ni", axes, observations.x - fit.predicted)[rows]
     rounding = np.einsum("nji,njk,nki->ni", axes, observations.rounding, axes)[rows]
     stated = observations.stated_factor**2 * variances[rows]
     if (rounding > stated).mean() > _Settings.mostly_rounding:
         return None
-    factors = (np.square(left) / (stated + rounding)).mean(axis=0)
+    factors = (np.square(residuals) / (stated + rounding)).mean(axis=0)
     count = fit.independence * float(rows.sum())
     # Evidence of three sizes over one, minus the cost of two more parameters (Schwarz 1978).
     gained = 0.5 * count * float(3.0 * np.log(factors.mean()) - np.log(factors).sum())
@@ -46,14 +46,14 @@ def instrument_factor(fit: Fit) -> float:
     """Return the most probable factor on the stated standard deviations, given the residuals and the quantisation."""
     observations = fit.observations
     rows = fit.noise.weights >= 0.5
-    left = (observations.x - fit.predicted)[rows]
+    residuals = (observations.x - fit.predicted)[rows]
     stated, rounding = observations.stated[rows], observations.rounding[rows]
     if not rounding.any():
         return observations.stated_factor
     # Diagonalise both: with V stated Vᵀ = I and V rounding Vᵀ = diag(r), each coordinate has the variance f² + r.
     root = np.linalg.inv(np.linalg.cholesky(stated))
     shares, axes = np.linalg.eigh(root @ rounding @ np.swapaxes(root, 1, 2))
-    squares = np.square(np.einsum("nji,njk,nk->ni", axes, root, left)).ravel()
+    squares = np.square(np.einsum("nji,njk,nk->ni", axes, root, residuals)).ravel()
     variances = np.square(_Settings.factors)[:, None] + np.maximum(shares, 0.0).ravel()
     likelihood = -0.5 * (np.log(variances) + squares / variances).sum(axis=1)
     return float(_Settings.factors[int(np.argmax(likelihood))])

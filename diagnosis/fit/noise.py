@@ -25,7 +25,7 @@ class NoiseSettings:
     # Largest correlation of neighbouring rows that counts, and the largest that noise of an instrument is taken to
     # have: that of a slow tracker. With 0.6, three of six recordings of such a tracker were unexplained; with 0.8, two
     # of six errors that wander were noise.
-    most_alike, noise_alike = 0.99, 0.7
+    max_correlation, noise_alike = 0.99, 0.7
     window, burst = 61, 0.45  # a larger share of outliers within a window of so many rows is a change and not outliers
     rounded = 1e-9  # Floor of the residuals, in units of the stated noise: numerical rounding
 
@@ -48,12 +48,12 @@ class Noise:
         residuals: FloatArray,
         observations: Observations,
         start: Noise | None = None,
-        spent: Callable[[float], float] = lambda _: 0.0,
+        effective_dof: Callable[[float], float] = lambda _: 0.0,
     ) -> Noise:
         """Fit the most probable noise of residuals (n, 3), by expectation maximisation; untrusted rows are ignored.
 
         Args:
-            spent: effective number of parameters of a background of tolerances, for noise of a given size.
+            effective_dof: effective number of parameters of a background of tolerances, for noise of a given size.
         """
         trusted, outlier_density = observations.trusted, observations.outlier_density
         squares = np.einsum("ni,ni->n", residuals, residuals)
@@ -76,27 +76,27 @@ class Noise:
             share = float(np.clip(1.0 - weights[trusted].mean(), NoiseSettings.fewest_outliers, 0.5))
             weights[~trusted] = 0.0
             total = float(np.where(bursts, inlier, both)[trusted].sum())
-            counted = max(3.0 * max(float(weights.sum()), 1.0) - spent(sigma), 1.0)
+            counted = max(3.0 * max(float(weights.sum()), 1.0) - effective_dof(sigma), 1.0)
             before, sigma = sigma, float(np.sqrt(max((weights @ squares) / counted, NoiseSettings.rounded**2)))
             if abs(sigma - before) < NoiseSettings.still * sigma:
                 break
         return cls(sigma, share, weights, total)
 
 
-def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
+def correlation(residuals: FloatArray, begins: NDArray[np.bool_]) -> float:
     """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two standard errors.
 
     Args:
         begins: (n,), True in the first row after each break.
     """
     follows = ~begins[1:]
-    agree = float((left[1:][follows] * left[:-1][follows]).sum())
-    squares = float(np.square(left[1:][follows]).sum())
-    rho = float(np.clip(agree / max(squares, 1e-300), 0.0, NoiseSettings.most_alike))
+    agree = float((residuals[1:][follows] * residuals[:-1][follows]).sum())
+    squares = float(np.square(residuals[1:][follows]).sum())
+    rho = float(np.clip(agree / max(squares, 1e-300), 0.0, NoiseSettings.max_correlation))
     return rho if rho > 2.0 / np.sqrt(max(3.0 * float(follows.sum()), 1.0)) else 0.0
 
 
-def wanders(rho: float, begins: NDArray[np.bool_]) -> bool:
+def is_autocorrelated(rho: float, begins: NDArray[np.bool_]) -> bool:
     """Return True if residuals of neighbouring rows are surely more correlated than an instrument's noise.
 
     Args:

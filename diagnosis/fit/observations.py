@@ -35,10 +35,10 @@ class Observations:
     rounding: FloatArray  # covariance (n, 3, 3) [m²] from encoder quantisation
     stated_factor: float = 1.0  # factor of the instrument's standard deviations over the stated ones
     # rows (n,) at which the simulation lacks a state it needs; None for no such rows
-    doubtful: NDArray[np.bool_] | None = None
-    rattling: FloatArray | None = None  # covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed
+    ignored: NDArray[np.bool_] | None = None
+    play_covariance: FloatArray | None = None  # covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed
     play: FloatArray | float = 0.0  # displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none
-    is_whole: bool = False  # True if no row is ignored, since each is predicted by its own readings alone
+    ignores_history: bool = False  # True if no row is ignored, since each is predicted by its own readings alone
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
@@ -51,31 +51,33 @@ class Observations:
         else:
             stated = np.broadcast_to(_Settings.unit_m**2 * np.eye(3), (len(recording), 3, 3))
         motion = Motion.of(recording)
-        moved = simulation.run(motion).by_joint * (ticks(recording.q) / np.sqrt(12.0))
+        moved = simulation.run(motion).by_joint * (encoder_steps(recording.q) / np.sqrt(12.0))
         return cls(motion, recording.x, stated, moved @ np.swapaxes(moved, 1, 2))
 
     @cached_property
     def whitening(self) -> FloatArray:
         """W (n, 3, 3) such that W (x - truth) has equal and independent noise in all coordinates, up to one factor."""
-        covariances = self.own if self.rattling is None else self.own + self.rattling
+        covariances = (
+            self.noise_covariances if self.play_covariance is None else self.noise_covariances + self.play_covariance
+        )
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), dtype=np.float64)
 
     @property
-    def own(self) -> FloatArray:
+    def noise_covariances(self) -> FloatArray:
         """Covariances (n, 3, 3) [m²] of the instrument and of the encoders' quantisation, up to one factor."""
         return self.stated_factor**2 * self.stated + self.rounding
 
-    def with_rattle(self, ratio: FloatArray | float, ways: FloatArray) -> Observations:
+    def with_loose_marker(self, ratio: FloatArray | float, directions: FloatArray) -> Observations:
         """Return the same observations of a loose marker.
 
         Args:
             ratio: additional variance by its play relative to the noise, of all rows or of each (n,).
-            ways: direction of the play at each row (n, 3).
+            directions: direction of the play at each row (n, 3).
         """
-        variances = ratio * np.trace(self.own, axis1=1, axis2=2) / 3.0
-        return replace(self, rattling=variances[:, None, None] * ways[:, :, None] * ways[:, None, :])
+        variances = ratio * np.trace(self.noise_covariances, axis1=1, axis2=2) / 3.0
+        return replace(self, play_covariance=variances[:, None, None] * directions[:, :, None] * directions[:, None, :])
 
-    def without_play(self, play: FloatArray) -> Observations:
+    def without_marker_play(self, play: FloatArray) -> Observations:
         """Return the same observations with the displacement `play` (n, 3) [m] of the marker subtracted."""
         return replace(self, x=self.x + self.play - play, play=play)
 
@@ -83,14 +85,14 @@ class Observations:
         """Return a part of the observations, at increasing rows (m,), before anything is known about the noise."""
         return Observations(self.motion.some(rows), self.x[rows], self.stated[rows], self.rounding[rows])
 
-    def without(self, doubtful: NDArray[np.bool_]) -> Observations:
+    def ignoring(self, ignored: NDArray[np.bool_]) -> Observations:
         """Return the same observations, ignoring some rows (n,)."""
-        return replace(self, doubtful=doubtful)
+        return replace(self, ignored=ignored)
 
     @property
-    def whole(self) -> Observations:
+    def without_history(self) -> Observations:
         """The same observations for an arm without memory: all rows count, on both sides of a play."""
-        return replace(self, doubtful=None, rattling=None, is_whole=True)
+        return replace(self, ignored=None, play_covariance=None, ignores_history=True)
 
     def with_factor(self, stated_factor: float) -> Observations:
         """Return the same observations with another factor on the instrument's noise."""
@@ -111,9 +113,9 @@ class Observations:
     def trusted(self) -> NDArray[np.bool_]:
         """Rows (n,) whose preceding path was observed; at a run's start the state of joints with memory is unknown."""
         begins = self.motion.begins
-        if self.is_whole or begins.sum() * _Settings.rows_a_run > len(self):
+        if self.ignores_history or begins.sum() * _Settings.rows_a_run > len(self):
             begins = np.zeros(len(self), dtype=np.bool_)
-        return ~begins if self.doubtful is None else ~(begins | self.doubtful)
+        return ~begins if self.ignored is None else ~(begins | self.ignored)
 
     @cached_property
     def outlier_density(self) -> FloatArray:
@@ -123,7 +125,7 @@ class Observations:
         return -np.log(volume) - np.linalg.slogdet(self.whitening)[1]
 
 
-def ticks(q: FloatArray) -> FloatArray:
+def encoder_steps(q: FloatArray) -> FloatArray:
     """Return the encoder step (d,) [rad, m] of each joint; 0 if readings (n, d) are not multiples of a step."""
     steps = np.zeros(q.shape[1])
     for k, column in enumerate(q.T):

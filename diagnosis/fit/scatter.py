@@ -77,5 +77,5 @@ def _most_scatter(fit: Fit, joint: int) -> float:
     """Return the upper bound of a joint's reading noise, 1-sigma [rad, m]: all residuals attributed to it."""
     by_joint = fit.weighted(fit.run.by_joint[:, :, [joint]])[:, :, 0]
     lengths = np.square(by_joint).sum(axis=1)
-    along = np.einsum("ni,ni->n", by_joint, fit.left)
+    along = np.einsum("ni,ni->n", by_joint, fit.weighted_residuals)
     return float(np.sqrt((np.square(along) / np.maximum(lengths, 1e-300)).sum() / max(lengths.sum(), 1e-300)))

@@ -8,11 +8,11 @@ from itertools import combinations
 import msgspec
 import numpy as np
 
-from bodyschema.diagnosis.assess.rivals import Rival, RivalSettings, Standing, resembles_sag
+from bodyschema.diagnosis.assess.rivals import Alternative, CauseAssessment, RivalSettings, resembles_sag
 from bodyschema.diagnosis.diagnosis import Diagnosis, DiagnosisSettings
 from bodyschema.diagnosis.fit.background import BackgroundSettings
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import WorthSettings, nats
+from bodyschema.diagnosis.fit.net_evidence import WorthSettings, evidence_gain
 from bodyschema.diagnosis.search.drives import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
@@ -86,20 +86,20 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 
 
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
-    found = diagnosis.tolerated
+    estimate = diagnosis.estimated_tolerances
     # A drive has errors of one and two periods per turn, each with a sine and a cosine, whose mean square is one half.
     angle_rad, drive_rad = BackgroundSettings.angle_rad, math.sqrt(4 / 2) * BackgroundSettings.drive_rad
     units = np.array([1e3 * BackgroundSettings.length_m, np.degrees(angle_rad), np.degrees(drive_rad)])
-    sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
-    wide = np.exp(HALF_WIDTH_95 * found.unsure[:3])
-    lowest = np.where(seen, sizes / wide, 0.0)
-    highest = np.where(seen, sizes * wide, units * found.most[:3])
+    sizes, is_detected = units * np.asarray(estimate.scales)[:3], estimate.is_detected[:3]
+    wide = np.exp(HALF_WIDTH_95 * estimate.log_sigma[:3])
+    lowest = np.where(is_detected, sizes / wide, 0.0)
+    highest = np.where(is_detected, sizes * wide, units * estimate.upper_limit[:3])
     ends = zip(sizes.tolist(), lowest.tolist(), highest.tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
     shares = diagnosis.shares
     in_extended = diagnosis.stored is diagnosis.extended or diagnosis.stored.background.scales is not None
     links, drives = 100.0 * shares.links, 100.0 * shares.drives
-    in_place = diagnosis.in_place_of_tolerances
+    in_place = diagnosis.alternatives_to_tolerances
     probable = [(effect, share) for effect, share in in_place if share >= RivalSettings.probable]
     rivals = tuple(Indistinguishable(*effect.key, "this_motion", share) for effect, share in probable)
     return Tolerances(
@@ -109,7 +109,7 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float, tolerances: Tolerances) -> Verdict:
     # A search that ends at its limit has only described the error, and so have tolerances beyond a workshop's.
-    if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
+    if diagnosis.unexplained.is_present or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
         return "undecided" if tolerances.leaves_open else "nothing_found"
@@ -132,29 +132,29 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
     # Causes that only describe the error may not exist at all.
     sure, causes = ResultSettings.even if diagnosis.ended_early else 1.0, []
-    parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
-    for cause, standing, share, squares in parts:
+    parts = zip(fit.causes, diagnosis.assessments, diagnosis.shares.causes, worse, strict=True)
+    for cause, assessment, share, squares in parts:
         causes.append(
             Cause(
                 effect=cause.name,
                 where=cause.where,
                 source=cause.source,
-                parameters=_parameters(diagnosis, cause, standing),
-                probability=sure * standing.probability,
+                parameters=_parameters(diagnosis, cause, assessment),
+                probability=sure * assessment.probability,
                 share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - squares**-0.5),
-                indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
-                rivals=tuple(_named(r) for r in standing.rivals),
-                evidence=evidence(standing, seen_by),
+                indistinguishable_from=tuple(_named(r) for r in assessment.rivals if r.is_same_here),
+                rivals=tuple(_named(r) for r in assessment.rivals),
+                evidence=evidence(assessment, seen_by),
             )
         )
     simulation = diagnosis.aligned.simulation
     what = _UNKNOWN_WEIGHT if simulation.bears_weight else _UNTESTED_WEIGHT
     giving = {cause.where for cause in fit.causes if cause.kind.is_spring}
     merged = merged_ripples(fit)
-    for k, (cause, standing) in enumerate(zip(fit.causes, diagnosis.standings, strict=True)):
+    for k, (cause, assessment) in enumerate(zip(fit.causes, diagnosis.assessments, strict=True)):
         beside_spring = not simulation.gravity.known and cause.where in giving and resembles_sag(cause.kind)
-        if beside_spring or standing.is_like_sag:
+        if beside_spring or assessment.is_like_sag:
             causes[k] = _or_unnamed(causes[k], what)
         if cause.identity in merged:
             causes[k] = _or_unnamed(causes[k], f"another error of {cause.where} that depends on its angle")
@@ -183,11 +183,11 @@ def _or_unnamed(cause: Cause, what: str) -> Cause:
     return msgspec.structs.replace(cause, probability=probability, rivals=(rival, *cause.rivals))
 
 
-def _named(rival: Rival) -> Indistinguishable:
+def _named(rival: Alternative) -> Indistinguishable:
     by = "any_motion" if rival.is_same_anywhere else "this_motion"
-    if isinstance(rival.itself, Effect):
-        return Indistinguishable(*rival.itself.key, by, rival.probability)
-    return Indistinguishable("unexplained", None, None, by, rival.probability, rival.itself.what)
+    if isinstance(rival.hypothesis, Effect):
+        return Indistinguishable(*rival.hypothesis.key, by, rival.probability)
+    return Indistinguishable("unexplained", None, None, by, rival.probability, rival.hypothesis.what)
 
 
 def _outliers(diagnosis: Diagnosis) -> Cause:
@@ -208,14 +208,14 @@ def _outliers(diagnosis: Diagnosis) -> Cause:
     )
 
 
-def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict[str, Interval]:
+def _parameters(diagnosis: Diagnosis, cause: Effect, assessment: CauseAssessment) -> dict[str, Interval]:
     fit = diagnosis.extended
     places = fit.places(cause)
     covariance = fit.covariance[np.ix_(places, places)]
     halves = HALF_WIDTH_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     fitted = [*cause.amounts, *cause.shapes]
     numbers = {}
-    for k in cause.told:
+    for k in cause.described:
         parameter, value = cause.parameters[k], float(cause.values[k])
         if k in fitted:
             half = float(halves[fitted.index(k)])
@@ -223,15 +223,15 @@ def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict
             low = max(value - half, 0.0) if k in cause.shapes else value - half
             numbers[parameter.name] = Interval(value, (low, value + half))
         else:
-            numbers[parameter.name] = Interval(value, _moment_interval(cause, standing.itself))
+            numbers[parameter.name] = Interval(value, _moment_interval(cause, assessment.hypothesis))
     return numbers | _derived(cause, covariance)
 
 
-def _moment_interval(cause: Effect, itself: Candidate) -> tuple[float, float]:
+def _moment_interval(cause: Effect, hypothesis: Candidate) -> tuple[float, float]:
     value = float(cause.values[-1])
-    if itself.interval is None:
+    if hypothesis.interval is None:
         return (value, value)
-    return (min(itself.interval[0], value), max(itself.interval[1], value))
+    return (min(hypothesis.interval[0], value), max(hypothesis.interval[1], value))
 
 
 def _derived(cause: Effect, covariance: FloatArray) -> dict[str, Interval]:
@@ -265,11 +265,14 @@ def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
 
 def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
     """Return the reason why a hypothesis with a small p-value is not a cause."""
-    if diagnosis.left.is_there:
+    if diagnosis.unexplained.is_present:
         return "what has no name shows in it"
-    if not candidate.effect.is_possible:
+    if not candidate.effect.is_valid:
         return "it would be negative"
-    if nats(candidate.gain, candidate.dof) - float(np.log(tried * candidate.trials)) < WorthSettings.named_nats:
+    if (
+        evidence_gain(candidate.gain, candidate.dof) - float(np.log(tried * candidate.trials))
+        < WorthSettings.named_nats
+    ):
         return "too little for its numbers"
     if diagnosis.ended_early:
         return "not reached"
@@ -277,27 +280,29 @@ def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
 
 
 def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
-    told = list(diagnosis.hypotheses.limitations)
+    sentences = list(diagnosis.hypotheses.limitations)
     sided = [cause for cause in diagnosis.causes if cause.kind.by_direction]
-    unknown_side = diagnosis.extended.doubtful(sided).mean()
+    unknown_side = diagnosis.extended.unknown_history(sided).mean()
     if unknown_side > DiagnosisSettings.most_doubtful:
         joints = ", ".join(str(cause.where) for cause in sided)
-        told.append(
+        sentences.append(
             f"At {100.0 * unknown_side:.0f} % of the pairs it is unknown on which side of its backlash {joints} rests: "
             "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
             "and move the joint to and fro in each."
         )
     if diagnosis.leaves_out or len(diagnosis.stored.causes) < len(diagnosis.causes):
-        told.append(_left_out(diagnosis.stored))
-    told += alias_sentences(diagnosis.extended)
+        sentences.append(_left_out(diagnosis.stored))
+    sentences += alias_sentences(diagnosis.extended)
     if is_at_limit(diagnosis.extended.background.scales):
-        told.append(
+        sentences.append(
             "Small errors everywhere would have to be larger than any workshop makes them: there may be several causes "
             "behind them that this recording does not separate. Move one joint at a time in another recording."
         )
     if diagnosis.ended_early:
-        told.append("The causes found describe the error and do not explain it: there may be others in their place.")
-    return tuple(told)
+        sentences.append(
+            "The causes found describe the error and do not explain it: there may be others in their place."
+        )
+    return tuple(sentences)
 
 
 def _left_out(stored: Fit) -> str:
@@ -312,13 +317,13 @@ def _left_out(stored: Fit) -> str:
 
 
 def _unexplained(diagnosis: Diagnosis) -> Unexplained:
-    left, joints = diagnosis.left, diagnosis.extended.simulation.robot.joints
-    names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
-    rattle_mm = 0.0 if left.rattle is None else 1e3 * left.rattle.half_m
-    if left.model is None:
-        rms = float(np.hypot(rattle_mm, 1e3 * left.unpredicted_m))
-        return Unexplained(rms, tuple(names), left.p_value, left.what, (), left.untold)
+    unexplained, joints = diagnosis.unexplained, diagnosis.extended.simulation.robot.joints
+    names = [joints[k] for k in unexplained.joints] + (["time"] if unexplained.with_time else [])
+    rattle_mm = 0.0 if unexplained.rattle is None else 1e3 * unexplained.rattle.half_m
+    if unexplained.model is None:
+        rms = float(np.hypot(rattle_mm, 1e3 * unexplained.autocorrelated_rms_m))
+        return Unexplained(rms, tuple(names), unexplained.p_value, unexplained.what, (), unexplained.not_storable)
     rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(diagnosis.modelled).sum(axis=1).mean())))
-    model = left.model.stored if diagnosis.stored is diagnosis.extended else None
+    model = unexplained.model.stored if diagnosis.stored is diagnosis.extended else None
     stored = () if model is None else tuple(dict.fromkeys(model.joints))
-    return Unexplained(rms, tuple(names), left.p_value, left.what, stored, left.untold)
+    return Unexplained(rms, tuple(names), unexplained.p_value, unexplained.what, stored, unexplained.not_storable)

@@ -48,7 +48,7 @@ _LABELS = {
     "share": "of the fixes",
 }
 # Parameters already given as amplitude and phase.
-_SAID_AGAIN = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
+_REDUNDANT = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
 
 
 class _Settings:
@@ -59,7 +59,7 @@ class _Settings:
 
 
 # Parameters of time and shape rather than size.
-_SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
+_NEVER_ZERO = ("t0", "cycles", "phase", "time_constant", "length", "hold")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +70,8 @@ class Number:
     # value, interval: with unit; the interval as a half width or as both ends, "" where there is none
     value: str
     interval: str
-    may_be_none: bool  # True if its interval contains zero
-    is_told: bool = True  # True if the recording determines it
+    may_be_zero: bool  # True if its interval contains zero
+    is_identifiable: bool = True  # True if the recording determines it
 
     def __str__(self) -> str:
         return f"{self.value} {self.interval}".rstrip()
@@ -83,21 +83,27 @@ def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
     Args:
         timed: True if the recording has times; otherwise a moment is a row number.
     """
-    names = [name for name in cause.parameters if name not in _SAID_AGAIN or not _has_amplitude(cause)]
+    names = [name for name in cause.parameters if name not in _REDUNDANT or not _has_amplitude(cause)]
     return [number(name, cause.parameters[name], timed=timed) for name in names]
 
 
-def told_values(cause: Cause) -> dict[str, float]:
+def identifiable_values(cause: Cause) -> dict[str, float]:
     """Return a cause's numbers without shifts and rotations that are not identifiable; all if none is identifiable."""
     parts = {name for name in cause.parameters if name.removeprefix("r")[1:] in ("_m", "_rad")}
-    told = {n: of.value for n, of in cause.parameters.items() if n not in parts or number(n, of).is_told}
-    return told if told.keys() & parts or not parts else {name: of.value for name, of in cause.parameters.items()}
+    identifiable = {
+        n: of.value for n, of in cause.parameters.items() if n not in parts or number(n, of).is_identifiable
+    }
+    return (
+        identifiable
+        if identifiable.keys() & parts or not parts
+        else {name: of.value for name, of in cause.parameters.items()}
+    )
 
 
-def telling(numbers: list[Number]) -> list[Number]:
+def significant_numbers(numbers: list[Number]) -> list[Number]:
     """Return the identifiable numbers that are not zero; if there are none, all identifiable ones."""
-    told = [n for n in numbers if n.is_told] or numbers
-    return [n for n in told if not n.may_be_none] or told
+    identifiable = [n for n in numbers if n.is_identifiable] or numbers
+    return [n for n in identifiable if not n.may_be_zero] or identifiable
 
 
 def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
@@ -110,8 +116,8 @@ def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
         label=_label(name),
         value=f"{row}{_fixed(value, digits, '+' if name.endswith(_SIGNED) else '')}{unit}",
         interval=_range(value, low, high, digits),
-        may_be_none=low <= 0.0 <= high and not name.startswith(_SAYS_HOW),
-        is_told=not any(name.endswith(end) and half > factor * limit for end, limit in _Settings.untold),
+        may_be_zero=low <= 0.0 <= high and not name.startswith(_NEVER_ZERO),
+        is_identifiable=not any(name.endswith(end) and half > factor * limit for end, limit in _Settings.untold),
     )
 
 

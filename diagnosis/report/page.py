@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.diagnosis.diagnosis import Diagnosis
-from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
+from bodyschema.diagnosis.report.numbers import chance, identifiable_values, mm, share
 from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Gain, Verdict
-from bodyschema.diagnosis.report.text import corrections, finding, in_order, made_to, modelled, to_do
+from bodyschema.diagnosis.report.text import actions, corrections, finding, in_order, modelled, tolerance_sentence
 from bodyschema.effects import Effect
 
 from . import tables
@@ -157,7 +157,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
 def _cause(
     residuals: Residuals, cause: Cause, effect: Effect | None, remedy: str, file: DiagnosisFile, *, opened: bool
 ) -> str:
-    numbers, seen_by, timed = told_values(cause), file.seen_by, residuals.timed
+    numbers, seen_by, timed = identifiable_values(cause), file.seen_by, residuals.timed
     said = finding(cause.effect, cause.where, cause.source, numbers, seen_by, timed=timed, weighed=file.weighed)
     plot = outlier_panel(residuals) if effect is None else presenter_of(effect.name).panel(residuals, effect)
     state = " open" if opened else ""
@@ -171,9 +171,9 @@ def _cause(
 def _tolerances(file: DiagnosisFile) -> str:
     if file.tolerances is None:
         return ""
-    use = to_do(file, [])[0]
-    told = " ".join([made_to(file.tolerances, file.seen_by), *use])
-    return f'<section id="tolerances"><p>{escape(told)}</p></section>'
+    use = actions(file, [])[0]
+    text = " ".join([tolerance_sentence(file.tolerances, file.seen_by), *use])
+    return f'<section id="tolerances"><p>{escape(text)}</p></section>'
 
 
 def _advice(file: DiagnosisFile) -> str:
@@ -196,8 +196,8 @@ _KEY = '<span class="before">■ before</span> <span class="after">■ after</sp
 
 def _against(residuals: Residuals) -> str:
     found = error_panels(residuals)
-    telling = [panel for panel in found if panel.is_telling]
-    silent = [panel for panel in found if not panel.is_telling]
+    telling = [panel for panel in found if panel.is_significant]
+    silent = [panel for panel in found if not panel.is_significant]
     shown = f'<div class="panels">{_panels(telling)}</div>' if telling else "<p>Nothing: the error depends on none.</p>"
     folded = ""
     if silent:

@@ -21,12 +21,12 @@ class Panel:
 
     title: str  # description of the plot
     svg: str  # the plot
-    tells: float = 1.0  # share of the variance before that depends on the plotted quantity
+    explained_share: float = 1.0  # share of the variance before that depends on the plotted quantity
 
     @property
-    def is_telling(self) -> bool:
+    def is_significant(self) -> bool:
         """True if the plot shows a clear dependence."""
-        return self.tells >= Layout.telling
+        return self.explained_share >= Layout.min_explained_share
 
     def html(self) -> str:
         return f"<figure><figcaption>{escape(self.title)}</figcaption>{self.svg}</figure>"
@@ -36,7 +36,7 @@ def error_panels(residuals: Residuals) -> list[Panel]:
     """Return all panels, the most informative first; those over time come last, as they show moments."""
     found = [*_by_joint(residuals), *_by_torque(residuals), *_by_image(residuals)]
     direction = _by_direction(residuals)
-    return [*sorted([*found, direction], key=lambda panel: -panel.tells), *_by_time(residuals)]
+    return [*sorted([*found, direction], key=lambda panel: -panel.explained_share), *_by_time(residuals)]
 
 
 def _compared(
@@ -49,8 +49,8 @@ def _compared(
     plot = Plot(*axes, span(x[rows]), span(before[rows], after[rows], cut=Layout.cut, around_zero=True))
     marks = [plot.dots(x[some], before[some], "pale before"), plot.dots(x[some], after[some], "pale after")]
     marks += [plot.bars(bins.x, bins.y, bins.half, look) for bins, look in means]
-    tells = max(structure(x[rows], y[rows]) for y in (before, after))
-    return Panel(title, plot.svg(*marks), tells)
+    explained_share = max(structure(x[rows], y[rows]) for y in (before, after))
+    return Panel(title, plot.svg(*marks), explained_share)
 
 
 def _by_joint(residuals: Residuals) -> Iterator[Panel]:
@@ -77,8 +77,8 @@ def _by_torque(residuals: Residuals) -> Iterator[Panel]:
 def _by_direction(residuals: Residuals) -> Panel:
     """Plot for each joint the distance between the means of both directions of motion."""
     joints, rows = residuals.robot.joints, residuals.rows
-    apart: dict[str, list[tuple[float, float, float]]] = {"before": [], "after": []}
-    tells = 0.0
+    by_sign: dict[str, list[tuple[float, float, float]]] = {"before": [], "after": []}
+    explained_share = 0.0
     for look, errors in (("before", residuals.before), ("after", residuals.after)):
         for k in range(len(joints)):
             way, error = residuals.direction[rows, k], residuals.along(k, errors)[rows]
@@ -86,9 +86,9 @@ def _by_direction(residuals: Residuals) -> Panel:
             if min(len(up), len(down)) < 2:
                 continue
             half = 1.96 * float(np.sqrt(up.var(ddof=1) / len(up) + down.var(ddof=1) / len(down)))
-            apart[look].append((k, float(up.mean() - down.mean()), half))
-            tells = max(tells, structure(way.astype(np.float64), error))
-    figures = {look: np.array(values).reshape(-1, 3) for look, values in apart.items()}
+            by_sign[look].append((k, float(up.mean() - down.mean()), half))
+            explained_share = max(explained_share, structure(way.astype(np.float64), error))
+    figures = {look: np.array(values).reshape(-1, 3) for look, values in by_sign.items()}
     everything = np.concatenate([np.abs(f[:, 1]) + f[:, 2] for f in figures.values()] or [np.ones(1)])
     plot = Plot(
         "joint",
@@ -101,7 +101,9 @@ def _by_direction(residuals: Residuals) -> Panel:
         plot.bars(f[:, 0] + s, f[:, 1], f[:, 2], look)
         for (look, f), s in zip(figures.items(), (-0.1, 0.1), strict=True)
     ]
-    return Panel("Against the direction of motion: error moving up less error moving down", plot.svg(*marks), tells)
+    return Panel(
+        "Against the direction of motion: error moving up less error moving down", plot.svg(*marks), explained_share
+    )
 
 
 def _by_time(residuals: Residuals) -> Iterator[Panel]:
@@ -116,7 +118,7 @@ def _by_time(residuals: Residuals) -> Iterator[Panel]:
             f"Over time, {name}",
             (residuals.clock_label, f"error {name} [mm]"),
         )
-        yield Panel(panel.title, _with_moments(residuals, panel.svg), panel.tells)
+        yield Panel(panel.title, _with_moments(residuals, panel.svg), panel.explained_share)
 
 
 def _with_moments(residuals: Residuals, svg: str) -> str:
@@ -148,9 +150,9 @@ def _by_image(residuals: Residuals) -> Iterator[Panel]:
     stretch = float(high[0] - low[0]) / Layout.cells[0] / longest
     plot = Plot("u in the left image [px]", "v [px]", (low[0], high[0]), (high[1], low[1]))
     marks = [plot.arrows(m[:, 0], m[:, 1], stretch * m[:, 2], stretch * m[:, 3], look) for look, m in means.items()]
-    tells = max(structure(at[:, i], error[:, j]) for error in errors.values() for i in (0, 1) for j in (0, 1))
+    explained_share = max(structure(at[:, i], error[:, j]) for error in errors.values() for i in (0, 1) for j in (0, 1))
     title = f"Over the image: mean errors; an arrow as long as a tenth of the width is {longest:.3g} px"
-    yield Panel(title, plot.svg(*marks), tells)
+    yield Panel(title, plot.svg(*marks), explained_share)
 
 
 def _framed(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:

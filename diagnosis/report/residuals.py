@@ -87,9 +87,9 @@ class Residuals:
         """Return factor and name of a joint's display unit."""
         return (1e3, "mm") if self.slides(joint) else (np.degrees(1.0), "°")
 
-    def amount(self, way: FloatArray, errors: FloatArray) -> FloatArray:
-        """Return the most probable multiple of `way` (n, 3) in errors (n, 3) [m], given the shape of the noise (n,)."""
-        expected, seen = (np.einsum("nij,nj->ni", self.whitening, vectors) for vectors in (way, errors))
+    def projected_amount(self, direction: FloatArray, errors: FloatArray) -> FloatArray:
+        """Return the most probable multiple (n,) of `direction` (n, 3) in errors (n, 3) [m], for the noise's shape."""
+        expected, seen = (np.einsum("nij,nj->ni", self.whitening, vectors) for vectors in (direction, errors))
         return np.einsum("ni,ni->n", expected, seen) / np.maximum(np.square(expected).sum(axis=1), 1e-300)
 
     @property
@@ -99,17 +99,17 @@ class Residuals:
 
     def along(self, joint: int, errors: FloatArray) -> FloatArray:
         """Return errors (n,) [mm] along the direction in which a joint moves the marker."""
-        way = self.run.by_joint[:, :, joint]
-        return 1e3 * self.amount(way, errors) * np.linalg.norm(way, axis=1)
+        derivative = self.run.by_joint[:, :, joint]
+        return 1e3 * self.projected_amount(derivative, errors) * np.linalg.norm(derivative, axis=1)
 
     def as_angle(self, joint: int, errors: FloatArray) -> FloatArray:
         """Return the joint error (n,) [°, mm] that best explains errors (n, 3)."""
-        return self.unit(joint)[0] * self.amount(self.run.by_joint[:, :, joint], errors)
+        return self.unit(joint)[0] * self.projected_amount(self.run.by_joint[:, :, joint], errors)
 
-    def telling(self, joint: int) -> NDArray[np.intp]:
+    def rows_moved_by(self, joint: int) -> NDArray[np.intp]:
         """Return the rows in which a joint moves the marker well."""
-        way = np.einsum("nij,nj->ni", self.whitening, self.run.by_joint[:, :, joint])
-        arm = np.linalg.norm(way, axis=1)[self.rows]
+        derivative = np.einsum("nij,nj->ni", self.whitening, self.run.by_joint[:, :, joint])
+        arm = np.linalg.norm(derivative, axis=1)[self.rows]
         return self.rows[arm >= ResidualSettings.tells * np.median(arm)]
 
     @cached_property
@@ -125,7 +125,7 @@ class Residuals:
         """Return the change of the measurements by an effect (n, 3) [m]."""
         return self.run.measured - self._simulated([e for e in self.run.simulation.effects if e is not effect])
 
-    def instead(self, effect: Effect, values: FloatArray) -> FloatArray:
+    def contribution_with(self, effect: Effect, values: FloatArray) -> FloatArray:
         """Return the change of the measurements by an effect with other parameters (n, 3) [m]."""
         others = [e for e in self.run.simulation.effects if e is not effect]
         return self._simulated([*others, effect.with_values(values)]) - self._simulated(others)

@@ -19,7 +19,7 @@ class Layout:
     width, height = 380, 236
     left, top, right, bottom = 52, 10, 370, 196  # the axes
     steps, ticks = (1.0, 2.0, 2.5, 5.0, 10.0), 5  # between ticks, and usual number of them
-    telling = 0.02  # share of the error variance that a plot must explain to be shown at first
+    min_explained_share = 0.02  # share of the error variance that a plot must explain to be shown at first
     cut = 0.01  # share of single errors at each end that does not set the range of a plot
     cells, fewest_in_a_cell = (10, 6), 3
     # Histogram: columns, the quantile of the errors at which it ends, and noise samples per row.

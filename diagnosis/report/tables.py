@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from bodyschema.diagnosis.report.numbers import Number, chance, mm, numbers_of, percent, place, share, telling
+from bodyschema.diagnosis.report.numbers import (
+    Number,
+    chance,
+    mm,
+    numbers_of,
+    percent,
+    place,
+    share,
+    significant_numbers,
+)
 from bodyschema.diagnosis.report.presenters.registry import rival_named
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 from bodyschema.diagnosis.report.text import in_order, other_shares
@@ -46,18 +55,18 @@ def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
             f"<td>{percent(cause.probability)}<td>{share(cause.share_of_gain_percent)}"
             f"<td>{cause.held_out_gain_percent:.1f} %"
         )
-        shown = _lines(telling(numbers_of(cause, timed=timed)))
+        shown = _lines(significant_numbers(numbers_of(cause, timed=timed)))
         rows.append(f"<tr><td>{escape(place(cause))}<td class=text>{shown}{figures}</tr>")
-    rows += [f"<tr><td>{told}<td><td><td>{share(part)}<td></tr>" for told, part in others]
+    rows += [f"<tr><td>{name}<td><td><td>{share(part)}<td></tr>" for name, part in others]
     return _table(("Cause", "Numbers, ± for 95 %", "Sure", "Share of the gain", "Gain"), rows)
 
 
 def numbers(cause: Cause, *, timed: bool) -> str:
     """Return all numbers of a cause, one per line, and name those that are not identifiable."""
     every = numbers_of(cause, timed=timed)
-    hidden = ", ".join(n.label for n in every if not n.is_told)
+    hidden = ", ".join(n.label for n in every if not n.is_identifiable)
     untold = f"<br><small>not determined by this motion: {escape(hidden)}</small>" if hidden else ""
-    return f"{_lines(n for n in every if n.is_told)}{untold}"
+    return f"{_lines(n for n in every if n.is_identifiable)}{untold}"
 
 
 def _lines(shown: Iterable[Number]) -> str:

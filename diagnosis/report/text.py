@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, can_be_measured, whole_range, widened
+from bodyschema.diagnosis.assess.rivals import (
+    Alternative,
+    CauseAssessment,
+    can_be_measured,
+    expected_separation,
+    whole_range,
+    wide_motion,
+)
 from bodyschema.diagnosis.assess.unnamed_alternative import UnnamedAlternative
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.presenters.presenter import FoundCause, Workshop
@@ -17,7 +24,7 @@ from bodyschema.effects.unexplained import PLACE
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
-from .numbers import told_values
+from .numbers import identifiable_values
 from .result import (
     OUTLIERS,
     Cause,
@@ -64,11 +71,11 @@ def corrections(count: int) -> str:
 def other_shares(diagnosis: DiagnosisFile) -> list[tuple[str, float]]:
     """Return the shares of the gain [%] of corrections without a cause, of drives and of links, with their names."""
     few = [cause.share_of_gain_percent for cause in diagnosis.causes if cause.is_correction]
-    told = [(corrections(len(few)), sum(few))] if few else []
+    named_shares = [(corrections(len(few)), sum(few))] if few else []
     if (of := diagnosis.tolerances) is not None:
         shares = ("small errors of drives", of.drives_share_percent), ("small errors of links", of.links_share_percent)
-        told += [(name, share) for name, share in shares if share > 0.0]
-    return told
+        named_shares += [(name, share) for name, share in shares if share > 0.0]
+    return named_shares
 
 
 def finding(
@@ -101,11 +108,11 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
     workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
     causes = in_order(diagnosis.causes)
     found = [replace(FoundCause.of(cause), weighed=diagnosis.weighed) for cause in causes]
-    told = [presenter_of(each.effect).remedy(workshop, what) for each, what in zip(causes, found, strict=True)]
-    return [_if_sure(cause, remedy, diagnosis) for cause, remedy in zip(causes, told, strict=True)]
+    texts = [presenter_of(each.effect).remedy(workshop, what) for each, what in zip(causes, found, strict=True)]
+    return [_with_confirmation(cause, remedy, diagnosis) for cause, remedy in zip(causes, texts, strict=True)]
 
 
-def _if_sure(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
+def _with_confirmation(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
     """Return the remedy, preceded by the checks to make before any change."""
     is_open = cause.probability < ResultSettings.sure
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and is_open]
@@ -142,21 +149,21 @@ def sentence(
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     nothing = not causes and verdict != "unexplained"
     if nothing and rms.extended < _Settings.by_tolerances * rms.aligned:
-        everywhere = f"small errors everywhere{_or_a_cause(tolerances, seen_by)}"
+        everywhere = f"small errors everywhere{_alternative_to_tolerances(tolerances, seen_by)}"
         return f"No cause stands out: {everywhere} explain {_share(gain)} ({figures})"
     if nothing and tolerances is not None and not tolerances.in_extended:
         return f"No cause stands out; small errors everywhere are not known well enough to correct {rms.aligned:.3g} mm"
     if nothing:
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
-        told = "What is measured differs from the simulation in a way that none of the known effects explains"
-        told += _or_a_cause(tolerances, seen_by)
+        text = "What is measured differs from the simulation in a way that none of the known effects explains"
+        text += _alternative_to_tolerances(tolerances, seen_by)
         if named_mm is None:
-            return told
-        if not _shows(tolerances):
-            return f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
+            return text
+        if not _has_share(tolerances):
+            return f"{text}; a smooth model of it explains {_share(gain)} ({figures})"
         figures += f", {named_mm:.3g} mm without the model"
-        return f"{told}; small errors everywhere and a smooth model of the rest explain {_share(gain)} ({figures})"
+        return f"{text}; small errors everywhere and a smooth model of the rest explain {_share(gain)} ({figures})"
     head = _head(causes, tolerances, seen_by, timed=timed, weighed=weighed)
     if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures})"
@@ -164,44 +171,49 @@ def sentence(
         figures += f", {named_mm:.3g} mm without the smooth model of the rest"
     elif tolerated_mm is not None and tolerated_mm < _Settings.by_tolerances * rms.aligned:
         figures += f", {tolerated_mm:.3g} mm with tolerances alone"
-    return f"{head}. RMS error {figures}{_open(verdict, causes, seen_by)}"
+    return f"{head}. RMS error {figures}{_open_part(verdict, causes, seen_by)}"
 
 
 def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool, weighed: bool) -> str:
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
-    everywhere = [f"small errors everywhere{_or_a_cause(tolerances, seen_by)}"] if _shows(tolerances) else []
+    everywhere = (
+        [f"small errors everywhere{_alternative_to_tolerances(tolerances, seen_by)}"] if _has_share(tolerances) else []
+    )
     first = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))]
     first = first[: _Settings.named]
-    said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
-    told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
-    if len(", ".join(told)) > _Settings.longest:
-        first, told = first[:1], told[:1]
+    findings = [
+        finding(c.effect, c.where, c.source, identifiable_values(c), seen_by, timed=timed, weighed=weighed)
+        for c in first
+    ]
+    clauses = [clause + _alternative(cause, seen_by) for clause, cause in zip(findings, first, strict=True)]
+    if len(", ".join(clauses)) > _Settings.longest:
+        first, clauses = first[:1], clauses[:1]
     if everywhere and first and first[-1].effect == OUTLIERS:
-        everywhere.append(told.pop())
+        everywhere.append(clauses.pop())
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]
     if more := others.count(False):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
     if more := others.count(True):
         everywhere.append(corrections(more))
-    parts = [*told, *everywhere]
+    parts = [*clauses, *everywhere]
     head = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
     return head[0].upper() + head[1:]
 
 
-def _shows(tolerances: Tolerances | None) -> bool:
+def _has_share(tolerances: Tolerances | None) -> bool:
     """Return True if small errors everywhere have more than a small share of the gain."""
     return tolerances is not None and tolerances.share_percent >= ResultSettings.small_percent
 
 
-def _or(cause: Cause, seen_by: str) -> str:
+def _alternative(cause: Cause, seen_by: str) -> str:
     """Return the most probable alternative of an uncertain cause, in parentheses."""
     if not cause.leaves_open:
         return ""
     return f" ({'more probably' if cause.is_outvoted else 'or'} {rival_named(cause.rivals[0], seen_by)})"
 
 
-def _or_a_cause(tolerances: Tolerances | None, seen_by: str) -> str:
+def _alternative_to_tolerances(tolerances: Tolerances | None, seen_by: str) -> str:
     """Return the most probable cause instead of large tolerances, in parentheses."""
     if tolerances is None or not tolerances.leaves_open:
         return ""
@@ -209,15 +221,15 @@ def _or_a_cause(tolerances: Tolerances | None, seen_by: str) -> str:
     return f" (or {rival_named(rival, seen_by)}, {100.0 * rival.probability:.0f} %)"
 
 
-def _open(verdict: Verdict, causes: Sequence[Cause], seen_by: str) -> str:
+def _open_part(verdict: Verdict, causes: Sequence[Cause], seen_by: str) -> str:
     """Return the part of a verdict's sentence on what remains open."""
     if verdict == "unexplained":
         return ". Part of the error remains unexplained"
     unsure = [cause for cause in causes if cause.leaves_open]
     if verdict != "undecided" or not unsure:
         return ""
-    told = [named(c.effect, c.where, c.source, seen_by) for c in unsure]
-    return f". Not sure: {', '.join(told)}; other causes explain as much"
+    names = [named(c.effect, c.where, c.source, seen_by) for c in unsure]
+    return f". Not sure: {', '.join(names)}; other causes explain as much"
 
 
 def _share(gain: Gain) -> str:
@@ -225,76 +237,78 @@ def _share(gain: Gain) -> str:
     return f"{explained} % of the error" if explained > 0 else "less than 1 % of the error"
 
 
-def made_to(tolerances: Tolerances, seen_by: str) -> str:
+def tolerance_sentence(tolerances: Tolerances, seen_by: str) -> str:
     """Return one sentence on the manufacturing tolerances of an arm; upper bounds if they are not detected."""
 
-    def told(size: Interval, unit: str, sign: str = "") -> str:
+    def formatted(size: Interval, unit: str, sign: str = "") -> str:
         low, high = size.ci95
         if high > _Settings.untold * low:
             return f"at most {sign}{high:.1g}{unit}"
         return f"about {sign}{size.value:.1g}{unit}"
 
-    length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
-    drives = told(tolerances.drive_deg, "°", "±")
-    return f"The arm is made to {length} and {angle}; its drives run true to {drives}.{_instead(tolerances, seen_by)}"
+    length, angle = formatted(tolerances.length_mm, " mm"), formatted(tolerances.angle_deg, "°")
+    drives = formatted(tolerances.drive_deg, "°", "±")
+    return (
+        f"The arm is made to {length} and {angle}; its drives run true to {drives}.{_alternatives(tolerances, seen_by)}"
+    )
 
 
-def _instead(tolerances: Tolerances, seen_by: str) -> str:
+def _alternatives(tolerances: Tolerances, seen_by: str) -> str:
     """Return a sentence on possible causes instead of large tolerances."""
-    told = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
-    if not told:
+    names = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
+    if not names:
         return ""
-    return f" Or the links are more exact than that, and there is {' or '.join(told)}."
+    return f" Or the links are more exact than that, and there is {' or '.join(names)}."
 
 
-def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str], list[str]]:
+def actions(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the steps to take, in order, and the remedies of small causes.
 
     Args:
         remedies: remedies of each cause, as returned by `remedies`.
     """
     ordered = list(zip(in_order(diagnosis.causes), remedies, strict=True)) if remedies else []
-    told = [remedy for cause, remedy in ordered if not cause.is_small]
+    steps = [remedy for cause, remedy in ordered if not cause.is_small]
     small = [remedy for cause, remedy in ordered if cause.is_small and not cause.is_correction]
     if more := sum(cause.is_correction for cause, _ in ordered):
         small.append(f"Change nothing because of {corrections(more)}: extended.toml has what is sure of them.")
     of = diagnosis.tolerances
     if of is not None and of.in_extended and of.share_percent >= ResultSettings.small_percent:
-        told.append(
+        steps.append(
             f"Use extended.toml: small errors of links and drives have a share of {of.share_percent:.0f} % of the gain,"
             " and no single one is worth fixing."
         )
-    return told, small
+    return steps, small
 
 
-def modelled(left: Unexplained) -> str:
+def modelled(rest: Unexplained) -> str:
     """Return one or two sentences on the smooth model in extended.toml; empty if no structure is left."""
-    told = []
-    if left.model_joints:
-        over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
-        told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
-    elif left.what:
+    sentences = []
+    if rest.model_joints:
+        over = "the marker's place" if rest.model_joints == PLACE else f"the readings of {', '.join(rest.model_joints)}"
+        sentences.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
+    elif rest.what:
         why = ": none that it can hold is right on pairs that were not fitted. More pairs may tell one"
-        told.append(f"extended.toml has no model of it{'' if left.not_in_model else why}.")
-    if left.not_in_model:
-        told.append(
-            f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "
+        sentences.append(f"extended.toml has no model of it{'' if rest.not_in_model else why}.")
+    if rest.not_in_model:
+        sentences.append(
+            f"What changes with time is in no such model: {'; '.join(rest.not_in_model)}. Another recording will "
             "differ by it again."
         )
-    return " ".join(told)
+    return " ".join(sentences)
 
 
-def evidence(standing: Standing, seen_by: str) -> str:
+def evidence(assessed: CauseAssessment, seen_by: str) -> str:
     text = (
-        f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
+        f"Without it the fit is worse by Δχ² = {assessed.gain:.0f} for {assessed.dof} number{'s' * (assessed.dof > 1)}"
     )
-    if not standing.rivals:
+    if not assessed.rivals:
         return f"{text}; nothing else comes near."
-    rival = standing.rivals[0]
-    return f"{text}; the nearest rival: {called(rival.itself, seen_by)} ({100 * rival.probability:.0f} %)."
+    rival = assessed.rivals[0]
+    return f"{text}; the nearest rival: {cause_name(rival.hypothesis, seen_by)} ({100 * rival.probability:.0f} %)."
 
 
-def called(cause: Effect | UnnamedAlternative, seen_by: str) -> str:
+def cause_name(cause: Effect | UnnamedAlternative, seen_by: str) -> str:
     return named(*cause.key, seen_by) if isinstance(cause, Effect) else cause.what
 
 
@@ -305,58 +319,58 @@ def advice(diagnosis: Diagnosis, causes: Sequence[Cause], seen_by: str) -> tuple
         causes: those of the diagnosis, possibly followed by outliers.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
-    told: list[str] = []
+    sentences: list[str] = []
     pairs: dict[str, list[str]] = {}
-    for cause, standing, found in zip(diagnosis.causes, diagnosis.standings, causes, strict=False):
-        for rival in () if found.is_correction else standing.rivals:
-            one, other = called(cause, seen_by), called(rival.itself, seen_by)
+    for cause, assessment, found in zip(diagnosis.causes, diagnosis.assessments, causes, strict=False):
+        for rival in () if found.is_correction else assessment.rivals:
+            one, other = cause_name(cause, seen_by), cause_name(rival.hypothesis, seen_by)
             if not rival.is_same_anywhere:
                 pairs.setdefault(_motion(diagnosis, rival), []).append(f"{one} from {other}")
-            elif can_be_measured(cause, rival.itself):
-                told.append(f"No motion tells {one} from {other}: measure both.")
-            elif not rival.is_one:
-                told.append(
+            elif can_be_measured(cause, rival.hypothesis):
+                sentences.append(f"No motion tells {one} from {other}: measure both.")
+            elif not rival.is_equivalent:
+                sentences.append(
                     f"No motion tells {one} from {other}, which can do more besides: "
                     "a longer recording of the same kind would show whether it does that."
                 )
-            elif isinstance(rival.itself, Effect):
-                told.append(f"No motion tells {one} from {other}: fix whichever is easier.")
-            if isinstance(rival.itself, UnnamedAlternative):
-                told.append(f"Watch whether {other}: {_WATCH[rival.itself.kind]}.")
-    told = [f"To tell {_some(told_apart)}, {motion}." for motion, told_apart in pairs.items()] + told
-    if diagnosis.left.rattle is not None:
-        told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
-    if what := diagnosis.left.unnamed:
-        joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
+            elif isinstance(rival.hypothesis, Effect):
+                sentences.append(f"No motion tells {one} from {other}: fix whichever is easier.")
+            if isinstance(rival.hypothesis, UnnamedAlternative):
+                sentences.append(f"Watch whether {other}: {_WATCH[rival.hypothesis.kind]}.")
+    sentences = [f"To tell {_joined(names)}, {motion}." for motion, names in pairs.items()] + sentences
+    if diagnosis.unexplained.rattle is not None:
+        sentences.append(f"Fasten the marker: {diagnosis.unexplained.rattle.what}.")
+    if what := diagnosis.unexplained.unnamed:
+        joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.unexplained.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""
-        told.append(f"None of the known effects fits {'; '.join(what)}.{where}{_of_the_model(diagnosis)}")
-    return tuple(dict.fromkeys(told))
+        sentences.append(f"None of the known effects fits {'; '.join(what)}.{where}{_of_the_model(diagnosis)}")
+    return tuple(dict.fromkeys(sentences))
 
 
 def _of_the_model(diagnosis: Diagnosis) -> str:
-    has_model = diagnosis.left.model is not None and diagnosis.left.model.stored is not None
+    has_model = diagnosis.unexplained.model is not None and diagnosis.unexplained.model.stored is not None
     is_stored = has_model and diagnosis.stored is diagnosis.extended
     return " The extended simulation is right about it only where the recording has been." if is_stored else ""
 
 
-def _some(pairs: Sequence[str]) -> str:
+def _joined(pairs: Sequence[str]) -> str:
     """Return the first of some pairs of causes, and the number of the others."""
     more = len(pairs) - _Settings.pairs
     return ", ".join(pairs[: _Settings.pairs]) + (f" and {more} more" if more > 0 else "")
 
 
-def _motion(diagnosis: Diagnosis, rival: Rival) -> str:
+def _motion(diagnosis: Diagnosis, rival: Alternative) -> str:
     """Return a clause on the joint that, moved through its whole range, best separates a cause from a rival."""
-    robot, fit = diagnosis.extended.simulation.robot, diagnosis.sought
-    apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
-    best = int(np.argmax(apart))
-    if apart[best] >= _Settings.worth_a_motion:
+    robot, fit = diagnosis.extended.simulation.robot, diagnosis.search_fit
+    separation = [expected_separation(fit, rival.fit_with_it, wide_motion(fit, [k])) for k in range(len(robot.joints))]
+    best = int(np.argmax(separation))
+    if separation[best] >= _Settings.worth_a_motion:
         low, high = whole_range(fit, best)
         unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
         return f"move joint {robot.joints[best]} through its whole range ({span}) in another recording"
     poses = "record poses over the whole range of all joints, with stops and at different speeds"
-    if rival.anywhere >= _Settings.worth_a_motion:
+    if rival.separation_anywhere >= _Settings.worth_a_motion:
         return poses
-    pairs = len(fit.observations) * _Settings.worth_a_motion / rival.anywhere
+    pairs = len(fit.observations) * _Settings.worth_a_motion / rival.separation_anywhere
     return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import WorthSettings, nats, rise_for
+from bodyschema.diagnosis.fit.net_evidence import WorthSettings, evidence_gain, required_rise
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
@@ -29,20 +29,27 @@ def with_small_ripples(fit: Fit) -> Fit:
         robot, scan = fit.simulation.robot, Scan(fit)
         moving = np.flatnonzero(np.ptp(fit.observations.motion.q, axis=0) > 0.0)
         found: list[Effect] = []
-        least = 2.0 * rise_for(WorthSettings.named_nats + np.log(len(moving)), 2)
+        least = 2.0 * required_rise(WorthSettings.named_nats + np.log(len(moving)), 2)
         for k in moving:
             candidate = scan.candidate(Effect.at(robot, "joint_ripple", robot.joints[k]), least)
-            if candidate is None or not fit.background.tolerates(candidate.effect) or _is_there(fit, candidate.effect):
+            if (
+                candidate is None
+                or not fit.background.is_within_tolerance(candidate.effect)
+                or _is_duplicate(fit, candidate.effect)
+            ):
                 continue
-            if nats(candidate.gain, candidate.dof) - np.log(len(moving) * candidate.trials) > WorthSettings.named_nats:
+            if (
+                evidence_gain(candidate.gain, candidate.dof) - np.log(len(moving) * candidate.trials)
+                > WorthSettings.named_nats
+            ):
                 found.append(candidate.effect)
         if not found:
             break
-        fit = fit.tolerating(scales, found)
+        fit = fit.with_tolerances(scales, found)
     return fit
 
 
-def _is_there(fit: Fit, ripple: Effect) -> bool:
+def _is_duplicate(fit: Fit, ripple: Effect) -> bool:
     """Return True if a fit already has a ripple of so similar a period that the two could cancel."""
     joint = fit.simulation.robot.joints.index(str(ripple.where))
     span = float(np.ptp(fit.observations.motion.q[:, joint])) / (1.0 if ripple.prismatic else 2.0 * np.pi)
@@ -56,16 +63,16 @@ def _is_there(fit: Fit, ripple: Effect) -> bool:
 
 def alias_sentences(fit: Fit) -> list[str]:
     """Return a sentence for each ripple of a fit that has an alias."""
-    told = []
+    sentences = []
     for cause in fit.causes:
         others = aliases(fit, cause) if cause.kind.is_periodic and not cause.prismatic else []
         if others:
             listed = ", ".join(f"{cycles:.0f}" for cycles in others[:3])
-            told.append(
+            sentences.append(
                 f"{cause.where} was read at such regular angles that a ripple of {cause.values[-1]:.0f} cycles a turn "
                 f"looks like one of {listed}{' and more' if len(others) > 3 else ''}. Read it at uneven angles."
             )
-    return told
+    return sentences
 
 
 def aliases(fit: Fit, ripple: Effect) -> list[float]:
@@ -75,8 +82,8 @@ def aliases(fit: Fit, ripple: Effect) -> list[float]:
     cycles = np.arange(_Settings.fewest_cycles, ScanSettings.finest_cycles + 1.0)
     # Compare waves of the same and of opposite phase; close neighbours of a ripple are not aliases.
     same = np.maximum(_agreement(cycles - own, q), _agreement(cycles + own, q)) > _Settings.same_phase
-    apart = np.abs(cycles - own) > 2.0 * np.pi / max(float(np.ptp(q)), 1e-6)
-    return [float(one) for one in cycles[same & apart]]
+    separate = np.abs(cycles - own) > 2.0 * np.pi / max(float(np.ptp(q)), 1e-6)
+    return [float(one) for one in cycles[same & separate]]
 
 
 def _agreement(cycles: FloatArray, q: FloatArray) -> FloatArray:

@@ -73,11 +73,11 @@ def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
     if not len(fit.precision):
         return errors
     precision = np.diag(fit.precision) * fit.noise.sigma**2
-    run_columns, products = fit.run_columns, _Products.of(fit, fit.columns, blocks)
-    inners, towards = products.inner.sum(axis=0), products.toward.sum(axis=0)
-    for fold, (inner, toward) in enumerate(zip(products.inner, products.toward, strict=True)):
+    derivatives, products = fit.derivatives, _Products.of(fit, fit.columns, blocks)
+    total_inner, total_rhs = products.inner.sum(axis=0), products.rhs.sum(axis=0)
+    for fold, (inner, rhs) in enumerate(zip(products.inner, products.rhs, strict=True)):
         own = blocks.fold == fold
-        errors[own] -= run_columns[own] @ solved(inners - inner + precision, towards - toward)
+        errors[own] -= derivatives[own] @ solved(total_inner - inner + precision, total_rhs - rhs)
     return errors
 
 
@@ -106,33 +106,38 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
 
 
 @dataclass(frozen=True, slots=True)
-class Added:
+class HeldOutGain:
     """Gain by one more hypothesis on held-out data."""
 
     held_out_gain_percent: float  # reduction of the squared error on held-out rows
     p_value: float  # p-value of no gain, from the agreement of blocks, for this hypothesis alone
 
 
-def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
+def held_out_gains(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[HeldOutGain]:
     """Return the first-order gain of each candidate on top of a fit."""
     effects = [candidate.effect for candidate in candidates]
-    fresh = np.concatenate([np.empty((*fit.left.shape, 0)), *(instruments(fit, one) for one in effects)], axis=2)
+    fresh = np.concatenate(
+        [np.empty((*fit.weighted_residuals.shape, 0)), *(instruments(fit, one) for one in effects)], axis=2
+    )
     ends = np.cumsum([0, *(len(one.amounts) for one in effects)])
     groups = [np.arange(first, end) for first, end in pairwise(ends)]
     usual = [FitSettings.largest * one.parameters[j].usual for one in effects for j in one.amounts]
     products = _Products.of(fit, np.concatenate([fit.columns, fresh], axis=2), blocks)
     precision = np.append(fit.precision, 1.0 / np.square(np.array(usual)))
-    before, *after = products.missed(precision, len(fit.precision), [np.arange(0), *groups]).tolist()
-    beside = beside_fit(fit, fresh)
+    before, *after = products.held_out_squares(precision, len(fit.precision), [np.arange(0), *groups]).tolist()
+    orthogonal = orthogonal_to_fit(fit, fresh)
     return [
-        Added(100.0 * (1.0 - missed / before if before > 0.0 else 0.0), _p_value(fit, beside[:, :, own], blocks))
-        for missed, own in zip(after, groups, strict=True)
+        HeldOutGain(
+            100.0 * (1.0 - held_out_squares / before if before > 0.0 else 0.0),
+            _p_value(fit, orthogonal[:, :, own], blocks),
+        )
+        for held_out_squares, own in zip(after, groups, strict=True)
     ]
 
 
 def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
     """Return the sum of squared held-out residuals of a fit after adding columns (n, 3, p)."""
-    return float(_Products.of(fit, columns, blocks).missed(precision, len(precision), [np.arange(0)])[0])
+    return float(_Products.of(fit, columns, blocks).held_out_squares(precision, len(precision), [np.arange(0)])[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +146,7 @@ class _Products:
 
     # inner, toward: (folds, p, p) and (folds, p)
     inner: FloatArray
-    toward: FloatArray
+    rhs: FloatArray
     square: float  # sum of squares of all residuals
     variance: float  # noise variance, in units of the stated one
 
@@ -151,11 +156,11 @@ class _Products:
         rows = []
         for fold in range(HeldOutSettings.folds):
             own = np.flatnonzero(blocks.fold == fold)
-            rows.append((columns[own].reshape(3 * len(own), columns.shape[2]), fit.left[own].ravel()))
-        inner, toward = np.array([c.T @ c for c, _ in rows]), np.array([c.T @ left for c, left in rows])
-        return cls(inner, toward, float(np.square(fit.left).sum()), fit.noise.sigma**2)
+            rows.append((columns[own].reshape(3 * len(own), columns.shape[2]), fit.weighted_residuals[own].ravel()))
+        inner, rhs = np.array([c.T @ c for c, _ in rows]), np.array([c.T @ left for c, left in rows])
+        return cls(inner, rhs, float(np.square(fit.weighted_residuals).sum()), fit.noise.sigma**2)
 
-    def missed(self, precision: FloatArray, first: int, groups: Sequence[IntArray]) -> FloatArray:
+    def held_out_squares(self, precision: FloatArray, first: int, groups: Sequence[IntArray]) -> FloatArray:
         """Return sums (m,) of squared held-out residuals with the first columns and each of some groups of the others.
 
         Args:
@@ -163,19 +168,19 @@ class _Products:
             groups: indices (k,) among the columns after the first ones.
         """
         squares = np.full(len(groups), self.square)
-        inners, towards = self.inner.sum(axis=0) + np.diag(precision) * self.variance, self.toward.sum(axis=0)
-        for inner, toward in zip(self.inner, self.toward, strict=True):
-            normal, wanted = inners - inner, towards - toward
-            across = normal[:first, first:]
+        total_inner, total_rhs = self.inner.sum(axis=0) + np.diag(precision) * self.variance, self.rhs.sum(axis=0)
+        for inner, rhs in zip(self.inner, self.rhs, strict=True):
+            normal, wanted = total_inner - inner, total_rhs - rhs
+            cross = normal[:first, first:]
             # Projection of each of the others onto the first columns, and their own amounts.
-            followed = solved(normal[:first, :first], np.column_stack([across, wanted[:first]]))
+            followed = solved(normal[:first, :first], np.column_stack([cross, wanted[:first]]))
             others, alone = followed[:, :-1], followed[:, -1]
-            left, sought = normal[first:, first:] - across.T @ others, wanted[first:] - across.T @ alone
+            left, sought = normal[first:, first:] - cross.T @ others, wanted[first:] - cross.T @ alone
             for k, own in enumerate(groups):
                 more = solved(left[np.ix_(own, own)], sought[own])
                 places = np.append(np.arange(first), first + own)
                 step = np.append(alone - others[:, own] @ more, more)
-                squares[k] += step @ (inner[np.ix_(places, places)] @ step - 2.0 * toward[places])
+                squares[k] += step @ (inner[np.ix_(places, places)] @ step - 2.0 * rhs[places])
         return squares
 
 
@@ -186,29 +191,29 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     neighbouring rows are correlated, as when a joint stands still and is rounded the same way repeatedly (Liang and
     Zeger 1986; Hotelling's T² for few blocks).
     """
-    return _p_value(fit, beside_fit(fit, columns), blocks)
+    return _p_value(fit, orthogonal_to_fit(fit, columns), blocks)
 
 
-def beside_fit(fit: Fit, columns: FloatArray) -> FloatArray:
-    """Return the part of columns (n, 3, k) orthogonal to a fit, `unshared`."""
-    flat = fit.unshared(columns.reshape(fit.left.size, -1))
-    basis = fit.orthogonal.reshape(fit.left.size, -1)
+def orthogonal_to_fit(fit: Fit, columns: FloatArray) -> FloatArray:
+    """Return the part of columns (n, 3, k) orthogonal to a fit, `fully_whitened`."""
+    flat = fit.fully_whitened(columns.reshape(fit.weighted_residuals.size, -1))
+    basis = fit.effect_basis.reshape(fit.weighted_residuals.size, -1)
     return (flat - basis @ (basis.T @ flat)).reshape(columns.shape)
 
 
-def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
+def _p_value(fit: Fit, orthogonal: FloatArray, blocks: Blocks) -> float:
     """Return the `block_p_value` of columns from their part orthogonal to the fit (n, 3, k)."""
-    flat = beside.reshape(fit.left.size, -1)
+    flat = orthogonal.reshape(fit.weighted_residuals.size, -1)
     inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     values, vectors = np.linalg.eigh(inner / np.outer(scales, scales))
-    told = values > TangentSettings.told_apart
-    k = int(told.sum())
+    identifiable = values > TangentSettings.told_apart
+    k = int(identifiable.sum())
     if not 0 < k < blocks.count:
         return 1.0
     # For orthonormal columns, the scores are the best-fitting amounts.
-    beside = beside @ (vectors[:, told] / np.sqrt(values[told]) / scales[:, None])
-    return scores_p_value(beside, fit.evident, blocks)
+    orthogonal = orthogonal @ (vectors[:, identifiable] / np.sqrt(values[identifiable]) / scales[:, None])
+    return scores_p_value(orthogonal, fit.whitened_residuals, blocks)
 
 
 def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> float:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from bodyschema.diagnosis.fit.fit import Fit, FitSettings
+from bodyschema.diagnosis.fit.net_evidence import choice_count, choice_counts, evidence_gain
 from bodyschema.diagnosis.fit.products import Products, System
 from bodyschema.diagnosis.fit.tangent import TangentSettings
-from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.motion import flanks
@@ -60,23 +60,23 @@ class Scan:
     """First-order tests of all hypotheses against one fit, complete or without one of its causes.
 
     Args:
-        besides: causes to leave out one at a time; these scans share most of the work.
+        left_out: causes to leave out one at a time; these scans share most of the work.
     """
 
-    def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
-        self._fit, self._products, self._state = fit, Products(fit, besides), 0
-        self._besides = tuple(cause.identity for cause in besides)
+    def __init__(self, fit: Fit, left_out: Sequence[Effect] = ()) -> None:
+        self._fit, self._products, self._state = fit, Products(fit, left_out), 0
+        self._left_out_causes = tuple(cause.identity for cause in left_out)
         self._before = {0: fit.run.measured}
 
     def without(self, cause: Effect) -> Scan:
-        """Return the scan of the fit without one of `besides`, all others refitted to first order."""
+        """Return the scan of the fit without one of `left_out`, all others refitted to first order."""
         scan = copy(self)
-        scan._state = 1 + self._besides.index(cause.identity)
+        scan._state = 1 + self._left_out_causes.index(cause.identity)
         return scan
 
-    def tolerates(self, effect: Effect) -> bool:
+    def is_within_tolerance(self, effect: Effect) -> bool:
         """Return True if the fit's background already contains such errors."""
-        return self._fit.background.tolerates(effect)
+        return self._fit.background.is_within_tolerance(effect)
 
     def candidates(self, hypotheses: Iterable[Effect], near: float = 0.0) -> list[Candidate]:
         """Return a candidate for each hypothesis that the data can test.
@@ -87,7 +87,7 @@ class Scan:
         found, most = [], 0.0
         for effect in sorted(hypotheses, key=lambda effect: len(effect.shapes)):
             candidate = self.candidate(effect, near * most)
-            if candidate is not None and candidate.effect.is_possible and np.isfinite(candidate.gain):
+            if candidate is not None and candidate.effect.is_valid and np.isfinite(candidate.gain):
                 found.append(candidate)
                 most = max(most, candidate.gain)
         return found
@@ -104,18 +104,18 @@ class Scan:
             case "moment":
                 return self._moment(effect)
             case "width":
-                return self._play(effect)
+                return self._backlash(effect)
             case "shape":
-                return self._finely(effect, effect.kind.trial_shapes(self._fit.observations.motion), least)
+                return self._shape_search(effect, effect.kind.trial_shapes(self._fit.observations.motion), least)
             case "load":
-                return self._hung(effect)
+                return self._loaded_backlash(effect)
             case _ if effect.kind.in_parts and effect.free is None:
                 return self._in_parts(effect)
             case _:
                 gains, amounts, dofs = self._solved(self._linear(effect), effect)
                 if not dofs[0]:
                     return None
-                return Candidate(effect.with_amounts(amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
+                return Candidate(effect.with_amounts(amounts[0]), float(gains[0]), int(dofs[0]), choice_count(effect))
 
     def _in_parts(self, effect: Effect) -> Candidate | None:
         """Return an effect with the subset of its amounts free that is worth its cost; None if none is identifiable."""
@@ -126,24 +126,24 @@ class Scan:
         inners, gradients = np.where(both, inner, 0.0), np.where(chosen, gradient, 0.0)
         gains, amounts = self._gains(inners, gradients, effect)
         dofs = self._dofs(inners, np.broadcast_to(raw, chosen.shape), effect)
-        ways = ways_to_choose(effect)[(chosen << np.array(effect.amounts)).sum(axis=1)]
-        worths = [
-            nats(float(gain), int(dof)) - np.log(way) if dof == size else -np.inf
+        ways = choice_counts(effect)[(chosen << np.array(effect.amounts)).sum(axis=1)]
+        net_evidences = [
+            evidence_gain(float(gain), int(dof)) - np.log(way) if dof == size else -np.inf
             for gain, dof, size, way in zip(gains, dofs, chosen.sum(axis=1), ways, strict=True)
         ]
-        best = int(np.argmax(worths))
-        if not np.isfinite(worths[best]):
+        best = int(np.argmax(net_evidences))
+        if not np.isfinite(net_evidences[best]):
             return None
-        freed = effect.freeing(tuple(np.array(effect.amounts)[chosen[best]].tolist()))
+        freed = effect.with_free_amounts(tuple(np.array(effect.amounts)[chosen[best]].tolist()))
         found = freed.with_amounts(amounts[best][chosen[best]])
-        return Candidate(found, float(gains[best]), int(dofs[best]), choices(found))
+        return Candidate(found, float(gains[best]), int(dofs[best]), choice_count(found))
 
-    def in_full(self, candidate: Candidate) -> Candidate:
+    def beyond_first_order(self, candidate: Candidate) -> Candidate:
         """Return the candidate with the gain at its actual amounts, if that exceeds the first-order gain.
 
         A rotation by some degrees is not linear compared with noise of a tenth of a millimetre.
         """
-        if not self._is_bent(candidate.effect):
+        if not self._is_nonlinear(candidate.effect):
             return candidate
         effects = [effect for effect in self._fit.simulation.effects if effect.identity != self._left_out]
         simulation, motion = self._fit.simulation, self._fit.observations.motion
@@ -151,13 +151,13 @@ class Scan:
             self._before[self._state] = simulation.with_effects(effects).run(motion).measured
         before = self._before[self._state]
         after = simulation.with_effects([*effects, candidate.effect]).run(motion).measured
-        inner, toward, _ = self._products.of(self._fit.weighted((after - before)[:, :, None])).at(self._state)
+        inner, rhs, _ = self._products.of(self._fit.weighted((after - before)[:, :, None])).at(self._state)
         square = self._products.squares[self._state]
-        explained = np.clip(toward[0, 0] ** 2 / max(float(inner[0, 0, 0]), 1e-300), 0.0, 0.999999 * square)
+        explained = np.clip(rhs[0, 0] ** 2 / max(float(inner[0, 0, 0]), 1e-300), 0.0, 0.999999 * square)
         gain = float(-3.0 * self._products.rows * np.log1p(-explained / square))
         return replace(candidate, gain=gain) if gain > candidate.gain else candidate
 
-    def _is_bent(self, effect: Effect) -> bool:
+    def _is_nonlinear(self, effect: Effect) -> bool:
         """Return True if an effect deviates from its first order by more than the noise.
 
         A move by d along an arc of radius r leaves its tangent by d²/2r.
@@ -172,25 +172,29 @@ class Scan:
 
     @property
     def _left_out(self) -> Identity | None:
-        return self._besides[self._state - 1] if self._state else None
+        return self._left_out_causes[self._state - 1] if self._state else None
 
-    def _finely(self, effect: Effect, shapes: FloatArray, least: float) -> Candidate | None:
+    def _shape_search(self, effect: Effect, shapes: FloatArray, least: float) -> Candidate | None:
         """Return the best fit of an effect with one shape parameter, at increasing shapes (m,), then between them."""
         # Each place without a cause uses the same coarse shapes.
-        gains, amounts, dofs = self._solved(self._products.kept(effect, lambda: self._each(effect, shapes)), effect)
+        gains, amounts, dofs = self._solved(
+            self._products.cached(effect, lambda: self._shape_systems(effect, shapes)), effect
+        )
         if not dofs.any():
             return None
-        told, best = shapes[dofs > 0], int(np.argmax(np.where(dofs > 0, gains, -np.inf)))
-        if self._times(float(gains[best]), ScanSettings.between) >= least:
-            place = int(np.searchsorted(told, shapes[best]))
-            shapes = np.linspace(told[max(place - 1, 0)], told[min(place + 1, len(told) - 1)], 13)
-            gains, amounts, dofs = self._solved(self._each(effect, shapes), effect)
+        identifiable, best = shapes[dofs > 0], int(np.argmax(np.where(dofs > 0, gains, -np.inf)))
+        if self._gain_of_squares(float(gains[best]), ScanSettings.between) >= least:
+            place = int(np.searchsorted(identifiable, shapes[best]))
+            shapes = np.linspace(
+                identifiable[max(place - 1, 0)], identifiable[min(place + 1, len(identifiable) - 1)], 13
+            )
+            gains, amounts, dofs = self._solved(self._shape_systems(effect, shapes), effect)
             best = int(np.argmax(gains))
         values = np.append(amounts[best], shapes[best])
         trials = ScanSettings.coarse * effect.kind.further_trials
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), trials)
 
-    def _each(self, effect: Effect, shapes: FloatArray) -> System:
+    def _shape_systems(self, effect: Effect, shapes: FloatArray) -> System:
         """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
         if not isinstance(effect.kind, EncoderEffect):
@@ -199,12 +203,12 @@ class Scan:
             factors = [effect.kind.growth(run.motion, float(shape)) for shape in shapes]
         else:
             place, encoder = self._fit.simulation.place(effect), effect.kind
-            rows = self._products.port(place.joint)
+            rows = self._products.joint_rows(place.joint)
             shaped = (np.append(effect.values[:-1], shape) for shape in shapes)
             factors = [encoder.columns(run.readings, place, values)[:, 0] for values in shaped]
         return rows.scaled(np.stack(factors, axis=1))
 
-    def _play(self, effect: Effect) -> Candidate | None:
+    def _backlash(self, effect: Effect) -> Candidate | None:
         """Return the best backlash over widths; the amount is the width itself."""
         place, encoder = self._fit.simulation.place(effect), effect.kind
         assert isinstance(encoder, EncoderEffect)
@@ -212,9 +216,9 @@ class Scan:
 
         def bent() -> System:
             by_width = [encoder.correction(self._fit.run.readings, place, np.array([w])) / w for w in widths]
-            return self._products.port(place.joint).scaled(np.stack(by_width, axis=1))
+            return self._products.joint_rows(place.joint).scaled(np.stack(by_width, axis=1))
 
-        gains, amounts, dofs = self._solved(self._products.kept(effect, bent), effect)
+        gains, amounts, dofs = self._solved(self._products.cached(effect, bent), effect)
         # Compare the width used to build the shape with the fitted one.
         off = np.abs(np.log(np.maximum(amounts[:, 0], 1e-12) / widths))
         gains = np.where(dofs > 0, np.where(off < np.log(3.0), gains, 0.5 * gains), -np.inf)
@@ -223,7 +227,7 @@ class Scan:
             return None
         return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(widths))
 
-    def _hung(self, effect: Effect) -> Candidate | None:
+    def _loaded_backlash(self, effect: Effect) -> Candidate | None:
         """Return the best loaded backlash over frictions; None if the load never changes sides."""
         run = self._fit.run
         k = self._fit.simulation.place(effect).joint
@@ -234,7 +238,7 @@ class Scan:
         if not changing.any() or not run.simulation.bears_weight:
             return None
         holds, sides = holds[changing], sides[:, changing]
-        best, gains, amounts, dof = self._best(self._products.port(k).scaled(0.5 * sides), effect)
+        best, gains, amounts, dof = self._best(self._products.joint_rows(k).scaled(0.5 * sides), effect)
         if not dof:
             return None
         values = np.append(amounts, holds[best])
@@ -252,28 +256,28 @@ class Scan:
         if not place.prismatic:
             apart = max(min(width, 0.1 * (ScanSettings.finest_cycles - ScanSettings.most_cycles)), step)
             bands.append(np.arange(ScanSettings.most_cycles + 1.0, ScanSettings.finest_cycles, apart))
-        tried, cycles = max(((self._rippled_best(effect, band), band) for band in bands), key=_most_gain)
-        if width < step or self._times(float(tried[1][tried[0]]), ScanSettings.between) >= least:
+        tried, cycles = max(((self._best_ripple(effect, band), band) for band in bands), key=_best_gain)
+        if width < step or self._gain_of_squares(float(tried[1][tried[0]]), ScanSettings.between) >= least:
             fine: FloatArray = cycles[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
             cycles = np.asarray(fine[fine > 0.5 * first], dtype=np.float64)
-            tried = self._best(self._rippled(effect, cycles), effect)
+            tried = self._best(self._ripple_system(effect, cycles), effect)
         best, gains, amounts, dof = tried
         if not dof:
             return None
         values = np.array([*amounts, cycles[best]])
         return Candidate(effect.with_values(values), float(gains[best]), dof, 2 * sum(map(len, bands)))
 
-    def _times(self, gain: float, factor: float) -> float:
+    def _gain_of_squares(self, gain: float, factor: float) -> float:
         """Return the gain that corresponds to explaining `factor` times the squares."""
         share = -np.expm1(-gain / (3.0 * self._products.rows))
         return float(-3.0 * self._products.rows * np.log1p(-min(factor * share, 0.999999)))
 
-    def _rippled_best(self, effect: Effect, cycles: FloatArray) -> _Tried:
+    def _best_ripple(self, effect: Effect, cycles: FloatArray) -> _Tried:
         """Return the best of a band of cycles, which is tried in place of each cause."""
         begun = effect.with_values(np.append(effect.values[:-1], cycles[0]))
-        return self._best(self._products.kept(begun, lambda: self._rippled(effect, cycles)), effect)
+        return self._best(self._products.cached(begun, lambda: self._ripple_system(effect, cycles)), effect)
 
-    def _rippled(self, effect: Effect, cycles: FloatArray) -> System:
+    def _ripple_system(self, effect: Effect, cycles: FloatArray) -> System:
         """Return the system of equally spaced numbers of cycles (m,)."""
         place = self._fit.simulation.place(effect)
         angle = self._fit.run.readings.q[:, place.joint] * (2.0 * np.pi if place.prismatic else 1.0)
@@ -282,28 +286,28 @@ class Scan:
         waves[:, 0] = np.exp(1j * cycles[0] * angle)
         waves[:, 1:] = np.exp(1j * (cycles[1] - cycles[0]) * angle)[:, None]
         np.multiply.accumulate(waves, axis=1, out=waves)
-        return self._products.port(place.joint).waved(waves)
+        return self._products.joint_rows(place.joint).modulated(waves)
 
     def _moment(self, effect: Effect) -> Candidate | None:
         """Return the best moment between two rows: a coarse search, then all near the best."""
-        n = len(self._fit.left)
+        n = len(self._fit.weighted_residuals)
         if n < 2 * ScanSettings.beside + 1:
             return None
         begun = effect.with_values(np.append(effect.values[:-1], -np.inf))
 
-        def since(rows: range) -> System:
+        def step_systems(rows: range) -> System:
             columns = self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts])
-            return self._products.since(columns, rows)
+            return self._products.step_systems(columns, rows)
 
         step = 1 + n // ScanSettings.most_moments
         some = range(ScanSettings.beside, n - ScanSettings.beside, step)
-        best, gains, amounts, dof = self._best(self._products.kept(effect, lambda: since(some)), effect)
+        best, gains, amounts, dof = self._best(self._products.cached(effect, lambda: step_systems(some)), effect)
         if not dof:
             return None
         tried, row = np.asarray(some), some[best]
         if step > 1:
             beside = range(max(row - step + 1, ScanSettings.beside), min(row + step, n - ScanSettings.beside))
-            best, closer, amounts, dof = self._best(since(beside), effect)
+            best, closer, amounts, dof = self._best(step_systems(beside), effect)
             row = beside[best]
             tried, first = np.unique(np.append(tried, beside), return_index=True)
             gains = np.append(gains, closer)[first]
@@ -323,11 +327,11 @@ class Scan:
                 return self._products.of(self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts]))
             place = self._fit.simulation.place(effect)
             factors = encoder.columns(self._fit.run.readings, place, effect.values)[:, effect.amounts]
-            return self._products.port(place.joint).mixed(factors)
+            return self._products.joint_rows(place.joint).mixed(factors)
 
-        return self._products.kept(effect, linear)
+        return self._products.cached(effect, linear)
 
-    def as_it_is(self, effect: Effect) -> float:
+    def present_gain(self, effect: Effect) -> float:
         """Return the `Candidate.gain` of an effect with its present moment, period or width."""
         columns = self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts])
         return float(self._solved(self._products.of(columns), effect)[0][0])
@@ -369,17 +373,17 @@ class Scan:
         """Return degrees of freedom (m,)."""
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
-        told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
-        return ((shares > TangentSettings.told_apart) & told).sum(axis=1)
+        identifiable = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
+        return ((shares > TangentSettings.told_apart) & identifiable).sum(axis=1)
 
 
-def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candidate | None:
+def refit_moment(fit: Fit, cause: Effect, rows: NDArray[np.bool_]) -> Candidate | None:
     """Return a cause that begins at a moment with its best moment.
 
     Args:
-        doubted: rows (n,) that count fully, since those on the wrong side of the moment look like outliers.
+        rows: rows (n,) that count fully, since those on the wrong side of the moment look like outliers.
     """
-    weights = np.where(doubted & fit.observations.trusted, 1.0, fit.noise.weights)
+    weights = np.where(rows & fit.observations.trusted, 1.0, fit.noise.weights)
     counted = replace(fit, noise=replace(fit.noise, weights=weights))
     return Scan(counted, [cause]).without(cause).candidate(cause)
 
@@ -402,6 +406,6 @@ def _eigenvalues(matrices: FloatArray) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
 
 
-def _most_gain(tried: tuple[_Tried, FloatArray]) -> float:
+def _best_gain(tried: tuple[_Tried, FloatArray]) -> float:
     (best, gains, _, _), _ = tried
     return float(gains[best])

@@ -11,12 +11,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from bodyschema.effects import Effect, Simulated
+from bodyschema.effects import Effect, PipelineRun
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from kbmaps.rotations import cross_matrix
 
-from .vergence import by_turn, undone
+from .vergence import by_turn, correct
 
 
 class _Settings:
@@ -35,11 +35,11 @@ class _Settings:
     beyond = 0.1
 
 
-Columns = Callable[[Simulated], FloatArray]
+Columns = Callable[[PipelineRun], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Family:
+class DiscrepancyFamily:
     """One family of smooth errors."""
 
     what: str  # short description
@@ -56,27 +56,27 @@ class Family:
     is_specific: bool = False  # True if it is as specific as a named effect
     # function from measured positions (n, 3) and parameters (p,) to the positions (n, 3) without it; None where
     # subtracting the linear columns is exact
-    undone: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+    correct: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
-    def columns(self, run: Simulated) -> FloatArray:
+    def columns(self, run: PipelineRun) -> FloatArray:
         """Return derivatives (n, 3, p) [m] of the measured positions by its parameters; p = a b if none are tied."""
         moved, functions = self.moved(run), self.functions(run)
         return (moved[:, :, :, None] * functions[:, None, None, :]).reshape(len(moved), 3, -1)
 
-    def moved(self, run: Simulated) -> FloatArray:
+    def moved(self, run: PipelineRun) -> FloatArray:
         """Return displacements (n, 3, m) [m], each scaled by any of `functions`; ties are already applied."""
         moves = self.moves(run)
         return moves if self.ties is None else (moves * self.amounts(run)[:, None, :]) @ self.ties
 
-    def functions(self, run: Simulated) -> FloatArray:
+    def functions(self, run: PipelineRun) -> FloatArray:
         """Return the functions (n, a) that each of `moved` may depend on; ones if they are tied."""
         return self.amounts(run) if self.ties is None else np.ones((len(run.motion), 1))
 
-    def along(self, functions: FloatArray) -> Family:
+    def along(self, functions: FloatArray) -> DiscrepancyFamily:
         """Return the subfamily whose motions follow given combinations (b, r) of the functions."""
         return replace(self, amounts=lambda run: self.amounts(run) @ functions)
 
-    def moved_by(self, run: Simulated, numbers: FloatArray) -> FloatArray:
+    def moved_by(self, run: PipelineRun, numbers: FloatArray) -> FloatArray:
         """Return the amount of each motion (n, a) for given parameters (p,)."""
         amounts = self.amounts(run)
         if self.ties is not None:
@@ -84,7 +84,7 @@ class Family:
         return amounts @ numbers.reshape(-1, amounts.shape[1]).T
 
 
-def families(run: Simulated) -> list[Family]:
+def families(run: PipelineRun) -> list[DiscrepancyFamily]:
     """Return all families that this motion can show."""
     robot, motion = run.simulation.robot, run.motion
     joints = [k for k in range(motion.q.shape[1]) if np.ptp(motion.q[:, k]) > 1e-4]
@@ -94,71 +94,75 @@ def families(run: Simulated) -> list[Family]:
         joint, link = _joint(k), _link(k)
         for j in joints:
             what = f"an error of {names[k]} that depends on {names[j]}"
-            found.append(Family(what, "joint", k, (j,), False, joint, _any_of_joint(j)))
+            found.append(DiscrepancyFamily(what, "joint", k, (j,), False, joint, _any_of_joint(j)))
             if j != k:
                 what = f"an error of {names[k]} that depends on itself and {names[j]} together"
-                found.append(Family(what, "joint", k, (k, j), False, joint, _any_of_both(k, j)))
+                found.append(DiscrepancyFamily(what, "joint", k, (k, j), False, joint, _any_of_both(k, j)))
         if timed:
             what = f"an error of {names[k]} that changes with time"
             for count in (count for count in _Settings.joint_times if _Settings.rows_a_wave * count < len(motion)):
-                found.append(Family(what, "joint", k, (), True, joint, _any_of_time(count)))
+                found.append(DiscrepancyFamily(what, "joint", k, (), True, joint, _any_of_time(count)))
             what = f"the link before {names[k]} changes with time"
-            found.append(Family(what, "body", k, (), True, link, _warming_or_any_of_time))
+            found.append(DiscrepancyFamily(what, "body", k, (), True, link, _warming_or_any_of_time))
         if run.simulation.shows_weight:
-            found += _giving(run, k)
+            found += _yielding_supports(run, k)
     if timed:
         for what, moves in (("the tool changes with time", _tool), ("the camera moves with time", _camera)):
-            found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))
+            found.append(DiscrepancyFamily(what, "body", None, (), True, moves, _warming_or_any_of_time))
         if robot.calibration is not None:
             what = "the lens refocuses: its focal length wanders"
             for count in (count for count in _Settings.joint_times if _Settings.rows_a_wave * count < len(motion)):
-                found.append(Family(what, "place", None, (), True, _along_axis, _any_of_time(count)))
+                found.append(DiscrepancyFamily(what, "place", None, (), True, _along_axis, _any_of_time(count)))
         for what, amounts in (
             ("the clocks of images and joints run apart", _shares_of_time),
             ("how late the images are changes with time", _waves_of_time),
         ):
             is_linear = amounts is _shares_of_time
-            found.append(Family(what, "clock", None, (), True, _late, amounts, is_specific=is_linear))
+            found.append(
+                DiscrepancyFamily(what, "clock", None, (), True, _per_second_late, amounts, is_specific=is_linear)
+            )
     for degree in (2, 3):
         what = "an error of depth that depends on where the marker is in the image"
-        found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
+        found.append(DiscrepancyFamily(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
         what = "an error that depends on where the marker is in the image"
-        found.append(Family(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
+        found.append(DiscrepancyFamily(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
     if robot.calibration is not None and robot.calibration.is_stereo:
         found.append(_turned("the eyes are turned towards each other", robot.calibration, np.eye(3)[1:2]))
         found.append(_turned("the eyes are turned against each other", robot.calibration, np.eye(3)))
     return found
 
 
-def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> Family:
+def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> DiscrepancyFamily:
     """Return the family of the right camera rotated about some of its axes (a, 3)."""
 
-    def moves(run: Simulated) -> FloatArray:
+    def moves(run: PipelineRun) -> FloatArray:
         return by_turn(run.measured, calibration, axes)
 
     def without(x: FloatArray, numbers: FloatArray) -> FloatArray:
-        return undone(x, calibration, numbers @ axes)
+        return correct(x, calibration, numbers @ axes)
 
-    return Family(what, "place", None, (), False, moves, _one, is_specific=True, undone=without)
+    return DiscrepancyFamily(what, "place", None, (), False, moves, _one, is_specific=True, correct=without)
 
 
-def _giving(run: Simulated, k: int) -> list[Family]:
+def _yielding_supports(run: PipelineRun, k: int) -> list[DiscrepancyFamily]:
     """Return families of a joint's support deflecting under the arm's weight: in any way, or by springs on its axes."""
     what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
-    found = [Family(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
-    supports = run.simulation.gravity.in_supports(k)
+    found = [DiscrepancyFamily(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
+    supports = run.simulation.gravity.in_support_frames(k)
     for T in (np.eye(4), *supports):
-        found.append(Family(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), ties=np.eye(6)))
+        found.append(
+            DiscrepancyFamily(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), ties=np.eye(6))
+        )
     # One torsional spring about all axes of a frame, without and with one linear spring along all of them.
     tilt, tilt_and_sink = np.repeat([[0.0], [1.0]], 3, axis=0), np.repeat(np.eye(2), 3, axis=0)
     for T, ties in product(supports if run.simulation.bears_weight else (), (tilt, tilt_and_sink)):
         moves, loads = _link_about(k, T), _own_loads(k, T)
-        found.append(Family(what, "body", None, (), False, moves, loads, ties, is_specific=True))
+        found.append(DiscrepancyFamily(what, "body", None, (), False, moves, loads, ties, is_specific=True))
     for T in map(_middle, supports if run.simulation.bears_weight else ()):
         if 2.0 * np.linalg.norm(T[:3, 3]) >= _Settings.shortest:
             moves, loads = _link_about(k, T), _own_loads(k, T)
             bend = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 0.0]]).T  # one spring about both axes across the link
-            found.append(Family(what, "body", None, (), False, moves, loads, bend, is_specific=True))
+            found.append(DiscrepancyFamily(what, "body", None, (), False, moves, loads, bend, is_specific=True))
     return found
 
 
@@ -180,9 +184,9 @@ def _joint(k: int) -> Columns:
 
 @cache
 def _link(k: int) -> Columns:
-    known: WeakKeyDictionary[Simulated, FloatArray] = WeakKeyDictionary()
+    known: WeakKeyDictionary[PipelineRun, FloatArray] = WeakKeyDictionary()
 
-    def moves(run: Simulated) -> FloatArray:
+    def moves(run: PipelineRun) -> FloatArray:
         if run not in known:
             robot = run.simulation.robot
             known[run] = run.columns(Effect.at(robot, "link_geometry", robot.joints[k]))
@@ -191,29 +195,29 @@ def _link(k: int) -> Columns:
     return moves
 
 
-def _tool(run: Simulated) -> FloatArray:
+def _tool(run: PipelineRun) -> FloatArray:
     return run.columns(Effect.at(run.simulation.robot, "tool_offset"))
 
 
-def _camera(run: Simulated) -> FloatArray:
+def _camera(run: PipelineRun) -> FloatArray:
     return run.columns(Effect.at(run.simulation.robot, "camera_pose"))
 
 
-def _late(run: Simulated) -> FloatArray:
+def _per_second_late(run: PipelineRun) -> FloatArray:
     """Return displacements per second of delay of the images."""
     return run.columns(Effect.at(run.simulation.robot, "camera_latency"))
 
 
-def _anywhere(run: Simulated) -> FloatArray:
+def _anywhere(run: PipelineRun) -> FloatArray:
     return np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
 
 
-def _in_depth(run: Simulated) -> FloatArray:
+def _in_depth(run: PipelineRun) -> FloatArray:
     """Return unit displacements along the ray on which the left camera sees the marker."""
     return run.measured[:, :, None]
 
 
-def _along_axis(run: Simulated) -> FloatArray:
+def _along_axis(run: PipelineRun) -> FloatArray:
     """Return displacements by a shorter focal length: along the optical axis, in proportion to the distance."""
     return run.measured[:, 2:, None] * np.eye(3)[:, 2:]
 
@@ -223,7 +227,7 @@ def _any_of_joint(j: int) -> Columns:
 
 
 def _any_of_both(k: int, j: int) -> Columns:
-    def amounts(run: Simulated) -> FloatArray:
+    def amounts(run: PipelineRun) -> FloatArray:
         of_one, of_other = _harmonics(run, k, 2), _harmonics(run, j, 2)
         both = of_one[:, :, None] * of_other[:, None, :]
         trends = np.concatenate([_trends(run, k), _trends(run, j), run.motion.q[:, [k]] * run.motion.q[:, [j]]], axis=1)
@@ -235,7 +239,7 @@ def _any_of_both(k: int, j: int) -> Columns:
 def _any_of_time(count: int) -> Columns:
     """Return a constant and cosines (n, count + 1) over the time of the recording."""
 
-    def amounts(run: Simulated) -> FloatArray:
+    def amounts(run: PipelineRun) -> FloatArray:
         clock = run.motion.clock
         share = (clock - clock[0]) / max(float(clock[-1] - clock[0]), 1e-9)
         return np.cos(np.pi * share[:, None] * np.arange(count + 1))
@@ -243,18 +247,18 @@ def _any_of_time(count: int) -> Columns:
     return amounts
 
 
-def _shares_of_time(run: Simulated) -> FloatArray:
+def _shares_of_time(run: PipelineRun) -> FloatArray:
     """Return the time (n, 1), from -1/2 to 1/2: a constant delay is a named effect."""
     clock = run.motion.clock
     return (clock - clock[0])[:, None] / max(float(clock[-1] - clock[0]), 1e-9) - 0.5
 
 
-def _waves_of_time(run: Simulated) -> FloatArray:
+def _waves_of_time(run: PipelineRun) -> FloatArray:
     """Return cosines (n, a) over the time of the recording, without a constant."""
     return _any_of_time(_Settings.times)(run)[:, 1:]
 
 
-def _warming_or_any_of_time(run: Simulated) -> FloatArray:
+def _warming_or_any_of_time(run: PipelineRun) -> FloatArray:
     clock = run.motion.clock
     share = (clock - clock[0]) / max(float(clock[-1] - clock[0]), 1e-9)
     return np.concatenate(
@@ -273,7 +277,7 @@ def _wrenches(k: int) -> Columns:
 def _link_about(k: int, T: FloatArray) -> Columns:
     """Return columns of the link before a joint, moved along and rotated about a frame with the joint at T (4, 4)."""
 
-    def moves(run: Simulated) -> FloatArray:
+    def moves(run: PipelineRun) -> FloatArray:
         along, about = np.split(_link(k)(run) @ np.kron(np.eye(2), T[:3, :3].T), 2, axis=2)
         return np.concatenate([along, about + along @ -cross_matrix(T[:3, 3])], axis=2)
 
@@ -283,7 +287,7 @@ def _link_about(k: int, T: FloatArray) -> Columns:
 def _own_loads(k: int, T: FloatArray) -> Columns:
     """Return force along and moment about each axis (n, 6) of a frame that has the joint at T (4, 4)."""
 
-    def loads(run: Simulated) -> FloatArray:
+    def loads(run: PipelineRun) -> FloatArray:
         moments, forces = (part @ T[:3, :3].T for part in np.split(run.wrenches[:, k], 2, axis=1))
         return np.concatenate([forces, moments + np.cross(T[:3, 3], forces)], axis=1)
 
@@ -293,7 +297,7 @@ def _own_loads(k: int, T: FloatArray) -> Columns:
 def _places_in_image(degree: int) -> Columns:
     """Return monomials (n, b) up to a degree in image position and relative distance."""
 
-    def amounts(run: Simulated) -> FloatArray:
+    def amounts(run: PipelineRun) -> FloatArray:
         x = run.measured
         depth = np.where(np.abs(x[:, 2]) > 1e-3, x[:, 2], 1e-3)
         scale = float(np.median(np.abs(depth)))
@@ -304,13 +308,13 @@ def _places_in_image(degree: int) -> Columns:
     return amounts
 
 
-def _trends(run: Simulated, j: int) -> FloatArray:
+def _trends(run: PipelineRun, j: int) -> FloatArray:
     """Return a joint's reading and its square (n, 2)."""
     q = run.motion.q[:, [j]]
     return np.concatenate([q, np.square(q)], axis=1)
 
 
-def _harmonics(run: Simulated, j: int, count: int) -> FloatArray:
+def _harmonics(run: PipelineRun, j: int, count: int) -> FloatArray:
     """Return sines and cosines (n, 2 count) of a joint's reading; a prismatic joint's range counts as half a turn."""
     q = run.motion.q[:, j]
     if run.simulation.robot.chain.prismatic[j]:
@@ -318,7 +322,7 @@ def _harmonics(run: Simulated, j: int, count: int) -> FloatArray:
     return np.concatenate([f(h * q)[:, None] for h in range(1, count + 1) for f in (np.sin, np.cos)], axis=1)
 
 
-def _one(run: Simulated) -> FloatArray:
+def _one(run: PipelineRun) -> FloatArray:
     return np.ones((len(run.motion), 1))
 
 
@@ -327,7 +331,7 @@ def _with_one(amounts: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
 
 
-def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[int]:
+def joints_of(family: DiscrepancyFamily, numbers: FloatArray, run: PipelineRun) -> frozenset[int]:
     """Return the erring joints and those that the error depends on, by their indices in q.
 
     Args:
@@ -339,7 +343,7 @@ def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[
     return own | frozenset(np.flatnonzero(shares(family, numbers, run) >= _Settings.shows).tolist())
 
 
-def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
+def shares(family: DiscrepancyFamily, numbers: FloatArray, run: PipelineRun) -> FloatArray:
     """Return the share of the error's variance due to each joint, given the others (d,).
 
     It is half the mean square change if only this joint is taken from another row (Jansen 1999).
@@ -354,7 +358,7 @@ def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
     by = family.moved_by(run, numbers)
     # Keep each row's directions fixed: the leverage of a joint on the marker does not count.
     lengths = np.einsum("nia,nib->nab", moves, moves)
-    variance = _square(lengths, by - by.mean(axis=0))
+    variance = _mean_square(lengths, by - by.mean(axis=0))
     found = np.zeros(run.motion.q.shape[1])
     for k in range(len(found)):
         q = run.motion.q.copy()
@@ -364,10 +368,10 @@ def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
         seen = ((there >= low - margin) & (there <= high + margin)).all(axis=1)
         change = (family.moved_by(other, numbers) - by)[seen]
         if seen.any():
-            found[k] = 0.5 * _square(lengths[seen], change) / max(variance, 1e-300)
+            found[k] = 0.5 * _mean_square(lengths[seen], change) / max(variance, 1e-300)
     return found
 
 
-def _square(lengths: FloatArray, by: FloatArray) -> float:
+def _mean_square(lengths: FloatArray, by: FloatArray) -> float:
     """Return the mean square displacement by moves (n, a) [m²]; `lengths` (n, a, a) are their products."""
     return float(np.einsum("na,nab,nb->n", by, lengths, by).mean())

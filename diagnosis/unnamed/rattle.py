@@ -10,7 +10,7 @@ from scipy.special import xlogy
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.search.together import tolerated
+from bodyschema.diagnosis.search.together import estimated_tolerances
 from bodyschema.interfaces.records import FloatArray
 
 
@@ -34,13 +34,13 @@ class _Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Rattle:
+class LooseMarker:
     """A loose marker."""
 
     half_m: float  # half of its play [m]
     ratio: float  # variance along the play over the variance across it, less one
     axis: FloatArray  # direction of the play in the marker's link (3,)
-    ways: FloatArray  # the same at each row (n, 3), in the measurement frame
+    directions: FloatArray  # the same at each row (n, 3), in the measurement frame
     sides: FloatArray  # mean of the side, -1 or 1, on which the marker lies at each row (n,)
     # log-likelihood of the residuals with two sides, less the cost of the tolerances beside it, comparable with
     # `likelihood` of a fit [nats]
@@ -51,24 +51,24 @@ class Rattle:
     def what(self) -> str:
         return f"the marker is loose on the hand, by ±{1e3 * self.half_m:.2g} mm"
 
-    def ways_of(self, fit: Fit) -> FloatArray:
+    def directions_at(self, fit: Fit) -> FloatArray:
         """Return the direction of the play at each row of a fit (n, 3), in the measurement frame."""
-        return np.einsum("nji,j->ni", _turns(fit), self.axis)
+        return np.einsum("nji,j->ni", _marker_rotations(fit), self.axis)
 
-    def taken_out_of(self, observations: Observations) -> Observations:
+    def removed_from(self, observations: Observations) -> Observations:
         """Return observations with the marker in the middle of its play, as far as its side at each row is known."""
         unsure = (1.0 - np.square(self.sides)) * self.ratio
-        middle = observations.without_play(self.half_m * self.sides[:, None] * self.ways)
-        return middle.with_rattle(unsure, self.ways)
+        middle = observations.without_marker_play(self.half_m * self.sides[:, None] * self.directions)
+        return middle.with_loose_marker(unsure, self.directions)
 
 
-def rattle(fit: Fit) -> Rattle | None:
+def rattle(fit: Fit) -> LooseMarker | None:
     """Return the play of the marker detected in the residuals of a fit; None if they do not lie on two sides."""
-    play = _two_sided(fit)
+    play = _estimated_play(fit)
     return play if play is not None and play.is_clear else None
 
 
-def rattle_beside(fit: Fit) -> Rattle | None:
+def rattle_with_refit(fit: Fit) -> LooseMarker | None:
     """Return the play of the marker, estimated together with the other parameters of a fit.
 
     The parameters may have followed the sides, and tolerances may hide them. So sides that are not clear yet are
@@ -76,67 +76,74 @@ def rattle_beside(fit: Fit) -> Rattle | None:
     workshop's: larger ones have probably followed the sides.
     """
     if fit.background.scales is not None and not fit.is_exact:
-        fit = fit.tolerating(fit.background.scales.no_larger)
-    play = _two_sided(fit)
+        fit = fit.with_tolerances(fit.background.scales.limited_to_workshop)
+    play = _estimated_play(fit)
     for _ in range(_Settings.fits if play is not None else 0):
         assert play is not None
-        fit = fit.to((_unfollowed(play, fit) if play.is_clear else play).taken_out_of(fit.observations))
+        fit = fit.to((_unabsorbed(play, fit) if play.is_clear else play).removed_from(fit.observations))
         if not fit.is_exact:
-            fit = fit.tolerating(tolerated(fit).scales)
-        again = _two_sided(fit)
+            fit = fit.with_tolerances(estimated_tolerances(fit).scales)
+        again = _estimated_play(fit)
         if again is None or again.likelihood < play.likelihood + _Settings.same:
             break
         play = again
     return play if play is not None and play.is_clear else None
 
 
-def _two_sided(fit: Fit) -> Rattle | None:
+def _estimated_play(fit: Fit) -> LooseMarker | None:
     """Return the most probable play, however small; None if the residuals are too few or have no noise."""
     rows = fit.noise.weights > 0.0
     if fit.is_exact or rows.sum() < 2 * _Settings.fewest:
         # With the play removed, positions of a simulation have no noise to compare it with.
         return None
-    left = _on_link(fit)
+    left = _residuals_on_link(fit)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
     along = left @ axes[:, 2]
-    ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
-    means, sigma, worth, sides = _two_sides(along, rows)
+    directions = np.einsum("nji,j->ni", _marker_rotations(fit), axes[:, 2])
+    means, sigma, net_evidence, sides = _fit_two_sides(along, rows)
     # Rows that are measured less accurately than others look like a second side.
-    stated = np.sqrt(np.einsum("ni,nij,nj->n", ways, fit.observations.own, ways))
-    worth = min(worth, _two_sides(along / stated, rows)[2])
-    alike = _alike(sides, rows, fit.observations.motion.begins)
+    stated = np.sqrt(np.einsum("ni,nij,nj->n", directions, fit.observations.noise_covariances, directions))
+    net_evidence = min(net_evidence, _fit_two_sides(along / stated, rows)[2])
+    alike = _same_side_evidence(sides, rows, fit.observations.motion.begins)
     if alike > 0.0:
-        sides = np.where(_on_their_way(sides), 0.0, sides)
-    worth += alike
+        sides = np.where(_changing_side(sides), 0.0, sides)
+    net_evidence += alike
     half = 0.5 * float(means[1] - means[0])
     ratio = float(variances[2] / max(variances[:2].mean(), _Settings.least_across**2 * variances[2])) - 1.0
     rarer = min(int((sides[rows] < 0.0).sum()), int((sides[rows] > 0.0).sum()))
     is_clear = (
-        2.0 * half >= _Settings.apart * sigma and worth >= _Settings.named and ratio >= _Settings.beyond_noise**2 - 1.0
+        2.0 * half >= _Settings.apart * sigma
+        and net_evidence >= _Settings.named
+        and ratio >= _Settings.beyond_noise**2 - 1.0
     )
     # A marker that changed its place once has slipped.
     sure = np.sign(sides[rows & (sides != 0.0)])
     is_clear = is_clear and int((np.diff(sure) != 0.0).sum()) > 1
-    whole = _likelihood(fit, rows) + worth - _Settings.unnamed
-    return Rattle(half, ratio, axes[:, 2], ways, sides, whole, is_clear and rarer >= _Settings.fewest)
+    whole = _likelihood(fit, rows) + net_evidence - _Settings.unnamed
+    return LooseMarker(half, ratio, axes[:, 2], directions, sides, whole, is_clear and rarer >= _Settings.fewest)
 
 
-def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
+def _unabsorbed(play: LooseMarker, fit: Fit) -> LooseMarker:
     """Return the play with these sides, at the size that it has if the fit and its tolerances absorb no part of it."""
     n, observations = len(play.sides), fit.observations
-    by_link = np.swapaxes(_turns(fit), 1, 2) * play.sides[:, None, None]
+    by_link = np.swapaxes(_marker_rotations(fit), 1, 2) * play.sides[:, None, None]
     taken_out = np.broadcast_to(observations.play, observations.x.shape)[:, :, None]
-    moved = fit.unshared(fit.weighted(np.concatenate([by_link, taken_out], axis=2)).reshape(3 * n, 4))
-    basis = fit.orthogonal.reshape(3 * n, -1)
+    moved = fit.fully_whitened(fit.weighted(np.concatenate([by_link, taken_out], axis=2)).reshape(3 * n, 4))
+    basis = fit.effect_basis.reshape(3 * n, -1)
     columns = moved[:, :3] - basis @ (basis.T @ moved[:, :3])
-    to_side = np.linalg.lstsq(columns, fit.evident.ravel() + moved[:, 3], rcond=None)[0]
+    to_side = np.linalg.lstsq(columns, fit.whitened_residuals.ravel() + moved[:, 3], rcond=None)[0]
     half = float(np.linalg.norm(to_side))
     if half == 0.0:
         return play
-    return replace(play, half_m=half, axis=to_side / half, ways=np.einsum("nji,j->ni", _turns(fit), to_side / half))
+    return replace(
+        play,
+        half_m=half,
+        axis=to_side / half,
+        directions=np.einsum("nji,j->ni", _marker_rotations(fit), to_side / half),
+    )
 
 
-def _alike(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]) -> float:
+def _same_side_evidence(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]) -> float:
     """Return the evidence that neighbouring rows lie on the same side: their mutual information [nats]."""
     follows = (rows & ~begins)[1:] & rows[:-1]
     upper = 0.5 * (1.0 + sides)
@@ -147,7 +154,7 @@ def _alike(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]
     return max(float((both * np.log(both / apart)).sum() - 0.5 * np.log(max(both.sum(), 1.0))), 0.0)
 
 
-def _on_their_way(sides: FloatArray) -> NDArray[np.bool_]:
+def _changing_side(sides: FloatArray) -> NDArray[np.bool_]:
     """Return the rows (n,) beside a change of the side, at which the marker may lie between the two."""
     changes = sides[1:] * sides[:-1] < 0.0
     return np.append(changes, False) | np.append(False, changes)
@@ -168,31 +175,33 @@ def _likelihood(fit: Fit, rows: NDArray[np.bool_]) -> float:
     off = max(total - count, 0)
     spread = observations.outlier_density[0] + np.linalg.slogdet(observations.whitening[0])[1]
     noise = (
-        -0.5 * count * (float(np.linalg.slogdet(np.cov(_on_link(fit)[rows].T))[1]) + 3.0 * np.log(2.0 * np.pi * np.e))
+        -0.5
+        * count
+        * (float(np.linalg.slogdet(np.cov(_residuals_on_link(fit)[rows].T))[1]) + 3.0 * np.log(2.0 * np.pi * np.e))
     )
     outliers = off * float(spread) + float(xlogy(off, off / total) + xlogy(count, count / total))
-    return noise + outliers - fit.prior_cost - (0.0 if scales is None else scales.doubt)
+    return noise + outliers - fit.prior_cost - (0.0 if scales is None else scales.prior_penalty)
 
 
-def _on_link(fit: Fit) -> FloatArray:
+def _residuals_on_link(fit: Fit) -> FloatArray:
     """Return the residuals (n, 3) [m] in the marker's link, its play included."""
-    return np.einsum("nij,nj->ni", _turns(fit), fit.observations.x + fit.observations.play - fit.predicted)
+    return np.einsum("nij,nj->ni", _marker_rotations(fit), fit.observations.x + fit.observations.play - fit.predicted)
 
 
-def _turns(fit: Fit) -> FloatArray:
+def _marker_rotations(fit: Fit) -> FloatArray:
     """Return the rotations (n, 3, 3) from the measurement frame to the marker's link."""
     run = fit.run
     return run.frames[:, -1, :3, :3].transpose(0, 2, 1) @ run.simulation.camera_pose[:3, :3]
 
 
-def _two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray, float, float, FloatArray]:
+def _fit_two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray, float, float, FloatArray]:
     """Fit two normal distributions of equal width to those of values (n,) that count, by expectation maximisation.
 
     Returns:
         Their means (2,), their width, the worth over a single one [nats], and the mean side of each value (n,).
     """
     counted, n = values[rows], int(rows.sum())
-    means, sigma, share = _split(counted)
+    means, sigma, share = _initial_split(counted)
     total = -np.inf
     for _ in range(_Settings.rounds):
         both, own = _shared(counted, means, sigma, share)
@@ -206,7 +215,7 @@ def _two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray,
     return means, sigma, total - single - float(np.log(n)), sides
 
 
-def _split(values: FloatArray) -> tuple[FloatArray, float, float]:
+def _initial_split(values: FloatArray) -> tuple[FloatArray, float, float]:
     """Return the means (2,) of the lower and the upper values (n,), cut where this is most probable; width, and share.
 
     One side may have few rows, so possibly none of the usual quantiles lies on it.

@@ -15,11 +15,11 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, solved
 from bodyschema.diagnosis.search.held_out import Blocks
-from bodyschema.effects import Motion, Simulated, Unexplained, place_map, smooth_map
+from bodyschema.effects import Motion, PipelineRun, Unexplained, place_map, smooth_map
 from bodyschema.interfaces.records import FloatArray
 
-from .families import Family
-from .family_fits import Apart
+from .families import DiscrepancyFamily
+from .family_fits import FitWithDiscrepancy
 
 
 class _Settings:
@@ -47,49 +47,53 @@ class SmoothModel:
     explained: FloatArray  # prediction of the functions at the rows (n, 3) [m]
     unstored: FloatArray  # the time-dependent part of it, which is not in the fit's simulation
     # change of each row's prediction by the stored simulation due to that row being fitted (n, 3) [m]
-    unseen: FloatArray
+    in_sample_change: FloatArray
 
 
-def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: Blocks) -> SmoothModel:
+def smooth_model(
+    alone: Fit, discrepancy_fit: FitWithDiscrepancy, families: Sequence[DiscrepancyFamily], blocks: Blocks
+) -> SmoothModel:
     """Learn the families' functions beside the causes of a fit.
 
     Args:
-        apart: the same causes beside the families.
+        discrepancy_fit: the same causes beside the families.
     """
-    said = apart.predicted - alone.predicted
-    lasting = [family for family in families if not family.over_time]
+    predicted_change = discrepancy_fit.predicted - alone.predicted
+    static = [family for family in families if not family.over_time]
     # All families of image position share the same functions, so one stands for all.
-    places = [family for family in lasting if family.kind == "place"]
-    lasting = [family for family in lasting if family.kind != "place"] + places[:1]
+    places = [family for family in static if family.kind == "place"]
+    static = [family for family in static if family.kind != "place"] + places[:1]
     timed = [family for family in families if family.over_time]
     # Try the causes as fitted alone and as fitted beside the families.
-    starts = [replace(fit, noise=apart.fit.noise) for fit in (alone, alone.at(apart.fit.simulation))]
-    learnt = [_learnt(fit, lasting, timed, blocks) for fit in starts]
-    fit, functions, amounts = min(learnt, key=lambda one: one[2].lasting_missed)
+    starts = [
+        replace(fit, noise=discrepancy_fit.fit.noise) for fit in (alone, alone.at(discrepancy_fit.fit.simulation))
+    ]
+    learnt = [_fit_functions(fit, static, timed, blocks) for fit in starts]
+    fit, functions, amounts = min(learnt, key=lambda one: one[2].static_squares)
     causes = _Amounts(starts[0], functions.columns[:, :, :0], _timed(fit, ()), blocks)
-    none = SmoothModel(starts[0], None, said, said, causes.unseen)
-    if not lasting or amounts.lasting_missed > causes.lasting_missed:
+    none = SmoothModel(starts[0], None, predicted_change, predicted_change, causes.in_sample_change)
+    if not static or amounts.static_squares > causes.static_squares:
         return none
     noise_m = _noise_m(fit)
-    stored, off_m = functions.stored(amounts.of_functions, _Settings.left_out * noise_m)
+    stored, off_m = functions.stored(amounts.function_amounts, _Settings.left_out * noise_m)
     if off_m > _Settings.too_far_off * noise_m:
         return none
     beside = fit.to(fit.observations, replace(fit.simulation, residual=stored))
     later = _Amounts(beside, functions.columns[:, :, :0], _timed(beside, timed), blocks)
-    explained = functions.shift(functions.given, amounts.of_functions) + later.in_time
-    return SmoothModel(beside, stored, explained, later.in_time, amounts.unseen)
+    explained = functions.shift(functions.given, amounts.function_amounts) + later.in_time
+    return SmoothModel(beside, stored, explained, later.in_time, amounts.in_sample_change)
 
 
-def _learnt(
-    fit: Fit, lasting: Sequence[Family], timed: Sequence[Family], blocks: Blocks
+def _fit_functions(
+    fit: Fit, static: Sequence[DiscrepancyFamily], timed: Sequence[DiscrepancyFamily], blocks: Blocks
 ) -> tuple[Fit, _Functions, _Amounts]:
     """Fit the amounts of all functions, following the curvature of erring joints while held-out errors allow it."""
-    functions = _Functions(fit, lasting)
+    functions = _Functions(fit, static)
     amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
-    for _ in range(_Settings.rounds if any(family.kind == "joint" for family in lasting) else 0):
-        bent = functions.bent(amounts.of_functions)
-        further = _Amounts(fit, functions.columns, _timed(fit, timed), blocks, bent)
-        if further.lasting_missed > _Settings.worse * amounts.lasting_missed:
+    for _ in range(_Settings.rounds if any(family.kind == "joint" for family in static) else 0):
+        nonlinear = functions.nonlinear(amounts.function_amounts)
+        further = _Amounts(fit, functions.columns, _timed(fit, timed), blocks, nonlinear)
+        if further.static_squares > _Settings.worse * amounts.static_squares:
             break
         amounts = further
     return fit, functions, amounts
@@ -101,13 +105,13 @@ def _noise_m(fit: Fit) -> float:
     return fit.noise.sigma * float(np.sqrt(np.square(roots).sum(axis=(1, 2)).mean()))
 
 
-def _timed(fit: Fit, families: Sequence[Family]) -> FloatArray:
+def _timed(fit: Fit, families: Sequence[DiscrepancyFamily]) -> FloatArray:
     """Return the columns (n, 3, p) of time-dependent families, each with an RMS of one."""
-    columns = _beside([family.columns(fit.run) for family in families], len(fit.residuals))
+    columns = _joined_columns([family.columns(fit.run) for family in families], len(fit.residuals))
     return columns / np.maximum(np.sqrt(3.0 * np.square(columns).mean(axis=(0, 1))), 1e-300)
 
 
-def _beside(columns: Sequence[FloatArray], rows: int) -> FloatArray:
+def _joined_columns(columns: Sequence[FloatArray], rows: int) -> FloatArray:
     return np.concatenate([np.empty((rows, 3, 0)), *columns], axis=2)
 
 
@@ -117,7 +121,7 @@ class _Functions:
     They are computed along the rigid chain with the effects that it can hold, so they depend on the readings alone.
     """
 
-    def __init__(self, fit: Fit, families: Sequence[Family]) -> None:
+    def __init__(self, fit: Fit, families: Sequence[DiscrepancyFamily]) -> None:
         self._simulation, self.given = fit.simulation, fit.observations.motion.q
         # A prismatic joint's functions cover the range of its readings.
         ends = [f(self.given[:, k]) for k in range(self.given.shape[1]) for f in (np.argmin, np.argmax)]
@@ -126,7 +130,7 @@ class _Functions:
         self._x = self._robot.chain.positions(self.given)
         self._centre, self._spread = self._x.mean(axis=0), self._x.std(axis=0) + 1e-9
         self._families = families
-        wide = self._at(self._wide())
+        wide = self._at(self._wide_postures())
         self._scales = np.maximum(np.sqrt(3.0 * np.square(wide).mean(axis=(0, 1))), 1e-12)
 
     @cached_property
@@ -147,7 +151,7 @@ class _Functions:
             return new if before is None else new + before.predict(q)
 
         if before is None and all(family.kind == "place" for family in self._families):
-            model = place_map(self._robot, lambda x: self._of_place(x) @ shares, self._x, tolerance_m)
+            model = place_map(self._robot, lambda x: self._place_functions(x) @ shares, self._x, tolerance_m)
             return model, 0.0
         model = smooth_map(self._robot, wanted, self.given, tolerance_m)
         off = model.predict(self.given) - wanted(self.given)
@@ -170,25 +174,25 @@ class _Functions:
             shift += run.simulation.positions(Motion.still(run.motion.q + errors)) - run.measured
         return shift[len(self._ends) :]
 
-    def bent(self, amounts: FloatArray) -> FloatArray:
+    def nonlinear(self, amounts: FloatArray) -> FloatArray:
         """Return the nonlinear part (n, 3) [m] of the displacement by erring joints at the rows of the fit."""
         return self.shift(self.given, amounts) - self.columns @ amounts
 
-    def _run(self, q: FloatArray) -> Simulated:
+    def _run(self, q: FloatArray) -> PipelineRun:
         return self._simulation.rigid.run(Motion.still(np.concatenate([self._ends, q])))
 
     def _at(self, q: FloatArray) -> FloatArray:
         run = self._run(q)
-        return _beside([self._columns(family, run) for family in self._families], len(run.q))[len(self._ends) :]
+        return _joined_columns([self._columns(family, run) for family in self._families], len(run.q))[len(self._ends) :]
 
-    def _columns(self, family: Family, run: Simulated) -> FloatArray:
+    def _columns(self, family: DiscrepancyFamily, run: PipelineRun) -> FloatArray:
         if family.kind == "place":
-            return self._of_place(self._robot.chain.positions(run.motion.q))
+            return self._place_functions(self._robot.chain.positions(run.motion.q))
         if family.kind == "joint":
             return family.moves(run) * self._turns(family, run)[:, None, :]
         return family.columns(run)
 
-    def _turns(self, family: Family, run: Simulated) -> FloatArray:
+    def _turns(self, family: DiscrepancyFamily, run: PipelineRun) -> FloatArray:
         """Return the functions (n, p) of a joint's error: periodic, and finer than those that detect its family."""
         if not family.drivers:
             return family.amounts(run)
@@ -197,14 +201,14 @@ class _Functions:
             first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
         return first
 
-    def _periodic(self, run: Simulated, joint: int, count: int) -> FloatArray:
+    def _periodic(self, run: PipelineRun, joint: int, count: int) -> FloatArray:
         """Return harmonics of a joint's reading (n, 2 count + 1); a prismatic joint's range counts as half a turn."""
         low, high = self.given[:, joint].min(), self.given[:, joint].max()
         scale = np.pi / (high - low) if self._robot.chain.prismatic[joint] else 1.0
         angles = scale * run.motion.q[:, [joint]] * np.arange(count + 1)
         return np.concatenate([np.cos(angles), np.sin(angles[:, 1:])], axis=1)
 
-    def _of_place(self, x: FloatArray) -> FloatArray:
+    def _place_functions(self, x: FloatArray) -> FloatArray:
         """Return cubic functions (n, 3, 60) of the marker's position; those of its rays cannot be stored (poles)."""
         place = (x - self._centre) / self._spread
         products = [np.ones((len(x), 1)), place]
@@ -214,7 +218,7 @@ class _Functions:
         amounts = np.concatenate(products, axis=1)
         return (np.eye(3)[:, :, None] * amounts[:, None, None, :]).reshape(len(x), 3, -1)
 
-    def _wide(self) -> FloatArray:
+    def _wide_postures(self) -> FloatArray:
         """Return postures over the joints' range; for prismatic joints, over that of the recording."""
         robot, q = self._robot, self.given
         slides = robot.chain.prismatic
@@ -227,13 +231,13 @@ class _Amounts:
     """Amounts of each function, with the causes' parameters free beside them."""
 
     def __init__(
-        self, fit: Fit, functions: FloatArray, timed: FloatArray, blocks: Blocks, bent: FloatArray | None = None
+        self, fit: Fit, functions: FloatArray, timed: FloatArray, blocks: Blocks, nonlinear: FloatArray | None = None
     ) -> None:
         self._fit, self._blocks = fit, blocks
-        self._left_m = fit.observations.x - fit.predicted - (0.0 if bent is None else bent)
+        self._left_m = fit.observations.x - fit.predicted - (0.0 if nonlinear is None else nonlinear)
         self._causes, self._lasting = len(fit.precision), functions.shape[2]
-        self._columns = np.concatenate([fit.run_columns, functions, timed], axis=2)
-        flat = fit.weighted(self._columns).reshape(fit.left.size, -1)
+        self._columns = np.concatenate([fit.derivatives, functions, timed], axis=2)
+        flat = fit.weighted(self._columns).reshape(fit.weighted_residuals.size, -1)
         left = fit.weighted(self._left_m[:, :, None]).ravel()
         self._folds, self._products = np.unique(blocks.fold), []
         for fold in self._folds:
@@ -241,59 +245,59 @@ class _Amounts:
             own = flat[rows]
             self._products.append((own.T @ own, own.T @ left[rows], float(left[rows] @ left[rows])))
         self._inner = np.sum([inner for inner, _, _ in self._products], axis=0)
-        self._toward = np.sum([toward for _, toward, _ in self._products], axis=0)
+        self._rhs = np.sum([rhs for _, rhs, _ in self._products], axis=0)
         tried = [(self._missed(size), size) for size in _Settings.sizes]
         self._size = min(tried)[1]
         self._all = self._solved(self._size)
 
     @property
-    def of_functions(self) -> FloatArray:
+    def function_amounts(self) -> FloatArray:
         """Amounts of the time-independent functions (p,)."""
         return self._all[self._causes :][: self._lasting]
 
     @property
     def in_time(self) -> FloatArray:
         """Time-dependent prediction (n, 3) [m], with the accompanying change of the causes' parameters."""
-        lasting = slice(self._causes, self._causes + self._lasting)
-        return self._columns @ self._all - self._columns[:, :, lasting] @ self._all[lasting]
+        static = slice(self._causes, self._causes + self._lasting)
+        return self._columns @ self._all - self._columns[:, :, static] @ self._all[static]
 
     @property
-    def lasting_missed(self) -> float:
+    def static_squares(self) -> float:
         """Held-out sum of squares, whitened, left by causes and lasting functions."""
-        left = self._fit.weighted((self._left_m - self.said + self.unseen)[:, :, None])
+        left = self._fit.weighted((self._left_m - self.predicted_change + self.in_sample_change)[:, :, None])
         return float(np.square(left).sum())
 
     @property
-    def said(self) -> FloatArray:
+    def predicted_change(self) -> FloatArray:
         """Change of the prediction (n, 3) [m] by causes and lasting functions."""
-        lasting = slice(0, self._causes + self._lasting)
-        return self._columns[:, :, lasting] @ self._all[lasting]
+        static = slice(0, self._causes + self._lasting)
+        return self._columns[:, :, static] @ self._all[static]
 
     @cached_property
-    def unseen(self) -> FloatArray:
+    def in_sample_change(self) -> FloatArray:
         """Change of each row's prediction (n, 3) [m] due to that row being in the fit."""
         more = np.zeros_like(self._fit.residuals)
-        lasting = slice(0, self._causes + self._lasting)
+        static = slice(0, self._causes + self._lasting)
         for k, fold in enumerate(self._folds):
             rows = self._blocks.fold == fold
             change = self._all - self._solved(self._size, without=k)
-            more[rows] = self._columns[rows][:, :, lasting] @ change[lasting]
+            more[rows] = self._columns[rows][:, :, static] @ change[static]
         return more
 
     def _missed(self, size: float) -> float:
         total = 0.0
-        for k, (inner, toward, square) in enumerate(self._products):
+        for k, (inner, rhs, square) in enumerate(self._products):
             amounts = self._solved(size, without=k)
-            total += square + float(amounts @ inner @ amounts - 2.0 * amounts @ toward)
+            total += square + float(amounts @ inner @ amounts - 2.0 * amounts @ rhs)
         return total
 
     def _solved(self, size: float, without: int | None = None) -> FloatArray:
         """Return all amounts under a prior of this size, from all rows or without those of one fold."""
-        free = len(self._toward) - self._causes
+        free = len(self._rhs) - self._causes
         precision = [self._fit.precision]
         precision.append(np.full(free, (size * _noise_m(self._fit)) ** -2))
         ridge = np.diag(np.concatenate(precision)) * self._fit.noise.sigma**2
         if without is None:
-            return solved(self._inner + ridge, self._toward)
-        inner, toward, _ = self._products[without]
-        return solved(self._inner - inner + ridge, self._toward - toward)
+            return solved(self._inner + ridge, self._rhs)
+        inner, rhs, _ = self._products[without]
+        return solved(self._inner - inner + ridge, self._rhs - rhs)

@@ -28,7 +28,7 @@ def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) ->
     return np.stack([one[:, 0] * depth, 0.5 * (one[:, 1] + other[:, 1]) * depth, depth], axis=1)
 
 
-def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
+def correct(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
     """Return the true points (n, 3) [m] that `reported` maps to x (n, 3) [m]."""
     points = x
     for _ in range(_Settings.rounds):

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from bodyschema.drivers.servos.model import Model
 
-from .device import Angle, Faults, OnlyAnswers, Reply, Sampling, byte_s, no_faults
+from .device import Angle, AnswerOnlyDevice, Faults, Reply, Sampling, byte_s, no_faults
 
 
 class _Settings:
@@ -80,7 +80,7 @@ class EmulatedServo(ABC):
 ServoT = TypeVar("ServoT", bound=EmulatedServo)
 
 
-class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
+class ServoChain(AnswerOnlyDevice, ABC, Generic[ServoT]):
     """Servos on one half-duplex wire.
 
     When several servos are asked at once, each waits for the end of the answer before its own, or for as long as that
@@ -157,7 +157,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     def _listening(self, baud: int) -> list[ServoT]:
         return [servo for servo in self.servos if abs((its := servo.baud) - baud) <= _Settings.baud_tolerance * its]
 
-    def _together(
+    def _common_answer(
         self, servos: list[ServoT], t: float, act: Callable[[ServoT, float], tuple[Any, bytes]], code: int
     ) -> list[Reply]:
         """Return the common answer of all servos with one ID (usually one servo); empty if no servo answers."""
@@ -166,14 +166,16 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         start = t + min(servo.return_delay_s for servo in servos)
         id = servos[0].id  # a servo that is given a new ID still answers with the old one
         done = [(servo, act(servo, start)) for servo in servos]
-        packets = [self._packet(servo, id, *told) for servo, told in done if self._will_answer(servo, code)]
+        packets = [self._packet(servo, id, *outcome) for servo, outcome in done if self._will_answer(servo, code)]
         return [Reply(id, start, mixed(packets))] if packets else []
 
-    def _in_turn(self, servos: list[ServoT], asked: list[tuple[int, int, int]], t: float, code: int) -> list[Reply]:
+    def _answers_in_turn(
+        self, servos: list[ServoT], requested: list[tuple[int, int, int]], t: float, code: int
+    ) -> list[Reply]:
         replies: list[Reply] = []
-        for id, address, size in asked:
-            there = [s for s in servos if s.id == id]
-            reply = self._together(there, t, lambda s, now, a=address, n=size: self._read(s, a, n, now), code)
+        for id, address, size in requested:
+            addressed = [s for s in servos if s.id == id]
+            reply = self._common_answer(addressed, t, lambda s, now, a=address, n=size: self._read(s, a, n, now), code)
             replies += reply
             begin, count = (reply[0].start, len(reply[0].data)) if reply else (t, size + self.overhead)
             t = begin + count * self._byte_s

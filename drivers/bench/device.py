@@ -51,7 +51,7 @@ class Device(Protocol):
         ...
 
 
-class OnlyAnswers:
+class AnswerOnlyDevice:
     """A device that never sends on its own."""
 
     speaks_at = math.inf

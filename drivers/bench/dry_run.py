@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from .device import Device
-from .faults import NOW_AND_THEN, AskedFault
+from .faults import NOW_AND_THEN, FaultSpec
 from .pty_shell import PtyShell
 
 
@@ -65,7 +65,7 @@ class DryRun:
         shells: pseudo-terminals, by name of the bus.
     """
 
-    def __init__(self, arm: BenchArm, links: Mapping[str, Path], *, faults: Sequence[AskedFault] = ()) -> None:
+    def __init__(self, arm: BenchArm, links: Mapping[str, Path], *, faults: Sequence[FaultSpec] = ()) -> None:
         """Prepare the ports without opening them.
 
         Args:
@@ -89,12 +89,12 @@ class DryRun:
 
     def events(self) -> Iterator[Event]:
         """Yield the requested recurring events: delay [s], description, and the function that triggers it."""
-        asked = [fault for fault in self._faults if fault.kind in NOW_AND_THEN]
-        while asked:
-            for fault in asked:
+        requested = [fault for fault in self._faults if fault.kind in NOW_AND_THEN]
+        while requested:
+            for fault in requested:
                 yield from self._happening(fault)
 
-    def _happening(self, fault: AskedFault) -> Iterator[Event]:
+    def _happening(self, fault: FaultSpec) -> Iterator[Event]:
         joint = fault.joint or ""
         if fault.kind == "unplug":
             yield _Settings.every_s, "unplugged", lambda: self._each(PtyShell.unplug)

@@ -81,13 +81,13 @@ class FaultKinds:
 
 
 @dataclass(frozen=True, slots=True)
-class AskedFault:
+class FaultSpec:
     kind: str  # its name
     joint: str | None  # joint whose servo or encoder is affected; None: all
     share: float  # the probability that an answer is affected, for faults on the wire
 
     @classmethod
-    def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds, usual_share: float = 0.02) -> AskedFault:
+    def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds, usual_share: float = 0.02) -> FaultSpec:
         """Parse `KIND[@JOINT][=SHARE]`.
 
         A wire fault with a joint affects every answer of its servo; without a joint it affects 2 % of all answers.
@@ -129,7 +129,9 @@ class WireFaults:
         self._faults, self._rng = tuple(faults), rng
 
     @classmethod
-    def asked(cls, faults: Sequence[AskedFault], kinds: FaultKinds, ids: Mapping[str, int], rng: Random) -> WireFaults:
+    def requested(
+        cls, faults: Sequence[FaultSpec], kinds: FaultKinds, ids: Mapping[str, int], rng: Random
+    ) -> WireFaults:
         """Select those of `faults` that affect a bus; `ids` maps the joints on it to servo IDs."""
         here = [f for f in faults if f.kind in kinds.on_the_wire and (f.joint is None or f.joint in ids)]
         strike = [(None if f.joint is None else ids[f.joint], f.share, kinds.on_the_wire[f.kind]) for f in here]

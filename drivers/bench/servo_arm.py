@@ -18,7 +18,7 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from .chain import ServoChain, ServoT
 from .device import Angle, Faults
 from .dry_run import GLITCH_TICKS, BenchArm
-from .faults import AskedFault, FaultKinds, WireFaults
+from .faults import FaultKinds, FaultSpec, WireFaults
 
 
 class _Settings:
@@ -80,7 +80,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         config: ConfigT,
         angles: Mapping[str, Angle],  # by joint, its angle as a function of time [rad]
         *,
-        faults: Sequence[AskedFault] = (),
+        faults: Sequence[FaultSpec] = (),
         return_delay_s: float = 0.0,
         seed: int = 0,
         now: Callable[[], float] = time.monotonic,
@@ -93,7 +93,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
             for entry in fitted:
                 self._servos[entry.joint] = self._servo(entry, shaft(config, entry, angles[entry.joint]))
             ids = {entry.joint: entry.id for entry in fitted}
-            wire = WireFaults.asked(faults, self.kinds, ids, self._rng)
+            wire = WireFaults.requested(faults, self.kinds, ids, self._rng)
             self.chains[name] = self._chain([self._servos[joint] for joint in ids], wire)
         for fault in faults:
             if fault.joint in self._servos:

@@ -90,17 +90,17 @@ class ThroughDriver:
 
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`. Return None also when the emulator could not be read."""
-        wanted = self._source.read(timeout_s)
-        if wanted is None:
+        source_reading = self._source.read(timeout_s)
+        if source_reading is None:
             return None
-        self._q = wanted.q.tolist()
+        self._q = source_reading.q.tolist()
         if self._behind is None:  # only once the first angles are known, or the arm would jump there
             angles = {name: self._angle(place) for place, name in enumerate(self.joints)}
             self._behind = self._opened.enter_context(self._open_bench(angles))
         for _ in range(ThroughDriverSettings.attempts):
-            told = self._behind.look()
-            if told is not None:
-                return JointReading(wanted.t, frozen_array(told.q))
+            driver_reading = self._behind.look()
+            if driver_reading is not None:
+                return JointReading(source_reading.t, frozen_array(driver_reading.q))
         return None
 
     def _angle(self, place: int) -> Angle:

@@ -9,7 +9,7 @@ from bodyschema.drivers.servos.bus import BITS_PER_BYTE, Answer, Exchange, Reque
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.model import Layout, Register
 from bodyschema.drivers.servos.packets import Packets
-from bodyschema.drivers.servos.scan import IDS, PingScanner, ServoProtocol, heard
+from bodyschema.drivers.servos.scan import IDS, PingScanner, ServoProtocol, receive_until
 from bodyschema.interfaces.protocols import Clock
 
 from .models import BY_NUMBER, FAST_HEADER, FASTEST1, HARDWARE_ERRORS, PING_SLOT_S, UNSUPPORTED
@@ -44,16 +44,16 @@ class Bus(ServoBus):
         return self._collect_fast(request) if request.is_fast else super()._collect(request)
 
     def _collect_fast(self, request: Request) -> Exchange:
-        inbox, count, size = self._inbox(request), len(request.ids), self._asked_size
+        inbox, count, size = self._inbox(request), len(request.ids), self._requested_size
         statuses, trouble = self._next(inbox, lambda received, at: PACKETS2.take_fast(received, at, count, size))
         if statuses is None:
-            self._note_owed(request, request.ids)
+            self._note_overdue(request, request.ids)
             return Exchange((), trouble)
         answers: list[Answer] = []
-        start_s = self._sent + self._question_size * self._byte_s + self.return_delay_s.get(request.ids[0], 0.0)
+        start_s = self._sent + self._request_bytes * self._byte_s + self.return_delay_s.get(request.ids[0], 0.0)
         part = FAST_HEADER
         for id, status in zip(request.ids, statuses, strict=True):
-            trouble = self._doubt(request, id, status, FAST_HEADER + count * status.size)
+            trouble = self._mismatch(request, id, status, FAST_HEADER + count * status.size)
             if trouble is not None:
                 return Exchange(tuple(answers), trouble, id)
             answers.append(self._timed(request, status, start_s + part * self._byte_s, inbox, inbox.at + part))
@@ -97,6 +97,6 @@ class Protocol2Scanner(PingScanner):
         port.flush()
         port.write(PACKETS2.ping(BROADCAST))
         wire_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud
-        received = heard(port, clock, clock.now() + len(IDS) * PING_SLOT_S + 2 * latency_s + HOST_S + wire_s)
+        received = receive_until(port, clock, clock.now() + len(IDS) * PING_SLOT_S + 2 * latency_s + HOST_S + wire_s)
         statuses, is_clean = self._statuses(received)
         return sorted({status.id for status in statuses}) if is_clean else super()._ids(port, clock, latency_s)

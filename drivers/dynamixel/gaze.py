@@ -146,5 +146,5 @@ class Gaze(PoweredJoints):
         lowest, highest = self._ranges[servo.joint]
         return min(max(goal, lowest), highest)
 
-    def _said_on(self) -> str:
+    def _on_message(self) -> str:
         return f"gaze is on: {', '.join(self._head)} turn to the hand. Keep fingers off the head"

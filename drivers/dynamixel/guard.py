@@ -71,7 +71,7 @@ class Guard:
         self._limits = limits
         self._why: str | None = "it was not begun"
         self._checked_s = -math.inf
-        self._doubts = 0
+        self._rejected_cycles = 0
         self._refusals: dict[str, int] = {}
         self._track: deque[tuple[float, FloatArray]] = deque()
         self._over_since = [math.inf] * len(limits.joints)
@@ -87,16 +87,16 @@ class Guard:
         Raises:
             Drop: it violates a limit.
         """
-        with self._lasting():
+        with self._permanent():
             self._check(now, motion)
 
     def check_servo(self, joint: str, state: ServoState) -> None:
         """Check the reported state of one servo, at intervals; raise Drop if it violates a limit."""
-        with self._lasting():
+        with self._permanent():
             self._check_servo(joint, state)
 
     @contextmanager
-    def _lasting(self) -> Iterator[None]:
+    def _permanent(self) -> Iterator[None]:
         """Raise Drop after any violation, and make one that is found permanent."""
         if self._why is not None:
             raise Drop(self._why)
@@ -114,14 +114,14 @@ class Guard:
                 "Run less beside it, or give a longer heartbeat_ms"
             )
         if motion is None:
-            self._doubts += 1
-            if self._doubts >= GuardSettings.doubtful_cycles:
+            self._rejected_cycles += 1
+            if self._rejected_cycles >= GuardSettings.doubtful_cycles:
                 raise Drop(
-                    f"{self._doubts} readings in a row could not be believed. "
+                    f"{self._rejected_cycles} readings in a row could not be believed. "
                     "Look at cable and supply: `bodyschema doctor`"
                 )
             return
-        self._doubts = 0
+        self._rejected_cycles = 0
         self._check_motion(motion)
 
     def _check_motion(self, motion: Motion) -> None:
@@ -212,8 +212,8 @@ class Currents:
         """
         if torques.shape != self._limit.shape or not np.isfinite(torques).all():
             raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")
-        wanted = self.share(now) * torques / self._constant
+        currents = self.share(now) * torques / self._constant
         self.saturated = tuple(
-            joint for joint, over in zip(self._joints, np.abs(wanted) > self._limit, strict=True) if over
+            joint for joint, over in zip(self._joints, np.abs(currents) > self._limit, strict=True) if over
         )
-        return np.clip(wanted, -self._limit, self._limit)
+        return np.clip(currents, -self._limit, self._limit)

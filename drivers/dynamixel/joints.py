@@ -31,7 +31,7 @@ from bodyschema.drivers.servos.settings import (
     RENAMED,
     Setting,
 )
-from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
+from bodyschema.drivers.servos.vendor import ReadMethod, ServoVendor, one_by_one
 
 from .models import (
     BAUDS1,
@@ -141,8 +141,8 @@ class Channel(ServoChannel):
         model = self.servo.model
         amperes = None if model.current_unit is None else current * model.current_unit
         alert = bool(answer.status.error & ALERT)
-        way = (self.question(answer), answer.earliest)
-        return Sample(*way, *between, position, velocity * model.velocity_unit, amperes, bool(moving), alert)
+        timing = (self.request_key(answer), answer.earliest)
+        return Sample(*timing, *between, position, velocity * model.velocity_unit, amperes, bool(moving), alert)
 
     def _of_protocol1(self, answer: Answer) -> Sample | None:
         position, speed, _, voltage, temperature, registered, _, moving = BLOCK1.unpack(answer.status.data)
@@ -150,8 +150,8 @@ class Channel(ServoChannel):
             return None
         velocity = (speed & NUMBER1) * self.servo.model.velocity_unit * (-1 if speed & SIGN1 else 1)
         alert = answer.status.error != 0
-        way = (self.question(answer), answer.earliest)
-        return Sample(*way, answer.earliest, answer.latest, position, velocity, None, bool(moving), alert)
+        timing = (self.request_key(answer), answer.earliest)
+        return Sample(*timing, answer.earliest, answer.latest, position, velocity, None, bool(moving), alert)
 
     def _is_possible(self, position: int) -> bool:
         if self.servo.model.ticks_per_turn is None:
@@ -159,7 +159,7 @@ class Channel(ServoChannel):
         return abs(position) <= LARGEST_POSITION1
 
 
-def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[Way]]:
+def read_methods_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[ReadMethod]]:
     """Return the read methods of each group: Protocol 1.0 as one, and each series of Protocol 2.0."""
     alone = [servo for servo in servos if servo.model.protocol == 1]
     series: dict[int, list[IdentifiedServo]] = {}
@@ -169,15 +169,15 @@ def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig)
     groups = [[one_by_one(bus, alone)]] if alone else []
     for group in series.values():
         layout, ids = group[0].model.layout, [servo.id for servo in group]
-        ways = [Way("Sync Read", (sync_request(layout, ids, fast=False),))]
+        read_methods = [ReadMethod("Sync Read", (sync_request(layout, ids, fast=False),))]
         if len(ids) > 1 and config.fast_sync_read == "auto":
-            ways.insert(0, Way("Fast Sync Read", (sync_request(layout, ids, fast=True),)))
-        groups.append(ways)
+            read_methods.insert(0, ReadMethod("Fast Sync Read", (sync_request(layout, ids, fast=True),)))
+        groups.append(read_methods)
     return groups
 
 
 DYNAMIXEL = ServoVendor(
-    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, tick_s=TICK_S
+    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, read_methods_of, settings_of, tick_s=TICK_S
 )
 
 

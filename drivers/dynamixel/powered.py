@@ -36,8 +36,8 @@ State = Literal["off", "on", "dropped"]
 class PoweredJoints(ABC):
     """Joints of an arm that have torque from a user's request until any check fails.
 
-    A `Drive`. Only a new request switches torque on again. `ask` and the properties may be used from any thread; all
-    else belongs to the reading thread.
+    A `TorqueController`. Only a new request switches torque on again. `ask` and the properties may be used from any
+    thread; all else belongs to the reading thread.
     """
 
     name: str
@@ -58,7 +58,7 @@ class PoweredJoints(ABC):
         self._sent: dict[str, int] = {}
         self._looked, self._next_look = 0, -math.inf
         self._missed: dict[str, int] = {}
-        self._unsure: tuple[str, ...] = ()
+        self._unverified: tuple[str, ...] = ()
         self._why, self._has_just_begun = "", False
         self.state: State = "off"
 
@@ -77,23 +77,25 @@ class PoweredJoints(ABC):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        said = []
-        if self._unsure:
-            said.append(f"the torque of {', '.join(self._unsure)} could not be verified off: switch the supply off")
+        messages = []
+        if self._unverified:
+            messages.append(
+                f"the torque of {', '.join(self._unverified)} could not be verified off: switch the supply off"
+            )
         if self.state == "dropped":
-            said.append(
+            messages.append(
                 f"{self.name} ended, torque off: {self._why}. Then ask again: `bodyschema command {self.name}_on`"
             )
-        return tuple(said)
+        return tuple(messages)
 
-    # --- `Drive`, by the thread that reads
+    # --- `TorqueController`, by the thread that reads
 
     def open(self, buses: Mapping[str, ServoBus], servos: Sequence[IdentifiedServo]) -> None:
         self._buses = {name: bus for name, bus in buses.items() if isinstance(bus, Bus)}
         by_joint = {servo.joint: place for place, servo in enumerate(servos)}
         self._places = [by_joint[joint] for joint in self._joints]
         self._servos = [servos[place] for place in self._places]
-        self._unsure = ()  # all were verified off
+        self._unverified = ()  # all were verified off
         for servo in self._servos:
             if servo.operating_mode != self.mode:
                 log.warning("%s is not possible as yet: %s", self.name, self._wrong_mode(servo, servo.operating_mode))
@@ -111,7 +113,7 @@ class PoweredJoints(ABC):
                 self._sent = dict(zip(self._joints, self._goals(now, reading.q, samples), strict=True))
                 self._write_all(self.goal, self._sent)
             if now >= self._next_look:
-                self._look_at_one(now)
+                self._inspect_one(now)
         except Drop as drop:
             self._drop(str(drop))
             return str(drop)
@@ -146,7 +148,7 @@ class PoweredJoints(ABC):
         """Return the goal registers, joint by joint; q (d,) are the angles of the whole arm [rad]; raise Drop."""
 
     @abstractmethod
-    def _said_on(self) -> str:
+    def _on_message(self) -> str:
         """Return the message for the user who requested it."""
 
     # --- torque on
@@ -175,11 +177,11 @@ class PoweredJoints(ABC):
 
     def _end(self) -> tuple[str, ...]:
         """Switch torque off on request; return the joints whose torque could not be verified off."""
-        unsure = self._let_go()
+        unverified = self._let_go()
         self.state, self._why = "off", ""
-        if not unsure:
+        if not unverified:
             log.info("%s was ended; torque is verified off", self.name)
-        return unsure
+        return unverified
 
     def _switch_on(self) -> str:
         if self.state == "on":
@@ -200,7 +202,7 @@ class PoweredJoints(ABC):
         self._missed, self._next_look, self._why, self._has_just_begun = {}, now, "", True
         self._begin(now)
         log.warning("%s is on: %s have torque", self.name, ", ".join(self._joints))
-        return self._said_on()
+        return self._on_message()
 
     def _prepared(self, servo: IdentifiedServo) -> int:
         """Check that torque is off and the mode right, set a safe goal and arm the watchdog; return the goal."""
@@ -234,36 +236,36 @@ class PoweredJoints(ABC):
         # A failure of one servo must not keep the others from being switched off.
         with suppress(Exception):
             self._write_all("torque", dict.fromkeys(self._joints, 0))
-        unsure = []
+        unverified = []
         for servo in self._servos:
             bus = self._buses[servo.bus]
             try:
                 switch_torque_off(bus, servo)
             except Exception as error:
                 log.debug("the torque of %s is not verified: %r", servo.joint, error)
-                unsure.append(servo.joint)
+                unverified.append(servo.joint)
                 continue
             with suppress(Exception):
                 self._write(servo, "watchdog", 0)
-        self._unsure = tuple(unsure)
-        return self._unsure
+        self._unverified = tuple(unverified)
+        return self._unverified
 
     # --- each cycle
 
     def _motion(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> Motion | None:
         newest = [samples[joint] for joint in self._joints]
-        believed = [sample for sample in newest if sample is not None]
-        if reading is None or len(believed) < len(newest):
+        known = [sample for sample in newest if sample is not None]
+        if reading is None or len(known) < len(newest):
             return None
         return Motion(
             reading.t,
             reading.q[self._places],
-            np.array([sample.velocity for sample in believed]),
-            np.array([sample.current or 0.0 for sample in believed]),
-            [sample.alert for sample in believed],
+            np.array([sample.velocity for sample in known]),
+            np.array([sample.current or 0.0 for sample in known]),
+            [sample.alert for sample in known],
         )
 
-    def _look_at_one(self, now: float) -> None:
+    def _inspect_one(self, now: float) -> None:
         servo = self._servos[self._looked % len(self._servos)]
         self._looked, self._next_look = self._looked + 1, now + GuardSettings.look_every_s
         layout = servo.model.layout
@@ -278,12 +280,12 @@ class PoweredJoints(ABC):
             return
         self._missed[servo.joint] = 0
         data = exchange.answers[0].status.data
-        told = {name: layout.value(name, data, begin) for name in ("torque", "hardware_error", "watchdog", self.goal)}
+        values = {name: layout.value(name, data, begin) for name in ("torque", "hardware_error", "watchdog", self.goal)}
         state = ServoState(
-            has_torque=told["torque"] == 1,
-            trouble="; ".join(text for bit, text in HARDWARE_ERRORS.items() if told["hardware_error"] & bit),
-            watchdog=told["watchdog"],
-            took_goal=told[self.goal] == self._sent[servo.joint],
+            has_torque=values["torque"] == 1,
+            trouble="; ".join(text for bit, text in HARDWARE_ERRORS.items() if values["hardware_error"] & bit),
+            watchdog=values["watchdog"],
+            took_goal=values[self.goal] == self._sent[servo.joint],
             temperature_c=float(layout.value("temperature", data, begin)),
         )
         self._guard.check_servo(servo.joint, state)

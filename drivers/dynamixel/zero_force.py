@@ -56,21 +56,21 @@ class ZeroForce(PoweredJoints):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        said = super().complaints
+        messages = super().complaints
         if self.state == "on" and self._sinking:
             names = ", ".join(self._sinking)
-            said += (f"zero_force: the current limit of {names} does not bear the arm here: it sinks. Hold it",)
-        return said
+            messages += (f"zero_force: the current limit of {names} does not bear the arm here: it sinks. Hold it",)
+        return messages
 
     def _prepare(self, servo: IdentifiedServo) -> int:
-        wanted = self._ticks(servo, self._limit[self._joints.index(servo.joint)])
+        ticks = self._ticks(servo, self._limit[self._joints.index(servo.joint)])
         allowed = self._read(servo, "current_limit")
-        if abs(wanted) > allowed:
+        if abs(ticks) > allowed:
             unit = servo.model.current_unit or math.nan
             raise RequestError(
                 f"joint {servo.joint!r} (ID {servo.id}): its own Current Limit is {allowed * unit:.2f} A. Give at most "
                 "that as current_limit_a, or type: "
-                f"`bodyschema servos current_limit={abs(wanted)} --joint {servo.joint}`"
+                f"`bodyschema servos current_limit={abs(ticks)} --joint {servo.joint}`"
             )
         return 0
 
@@ -90,7 +90,7 @@ class ZeroForce(PoweredJoints):
         self._sinking = saturated if now - self._saturated_s > GuardSettings.saturated_s else ()
         return [self._ticks(servo, current) for servo, current in zip(self._servos, currents, strict=True)]
 
-    def _said_on(self) -> str:
+    def _on_message(self) -> str:
         return (
             f"zero_force is on: within {GuardSettings.ramp_s:.0f} s {', '.join(self._joints)} bear the arm. Hold it "
             "until then, and stay ready to hold it: any doubt switches torque off"

@@ -25,7 +25,7 @@ from bodyschema.drivers.servos.settings import (
     RENAMED,
     Setting,
 )
-from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
+from bodyschema.drivers.servos.vendor import ReadMethod, ServoVendor, one_by_one
 
 from .models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, MODES, PING, READ, STS, SYNC_READ, WRITE
 
@@ -66,22 +66,22 @@ class Channel(ServoChannel):
         data, model = answer.status.data, self.servo.model
         layout = model.layout
 
-        def told(name: str) -> int:
+        def reported(name: str) -> int:
             return layout.value(name, data, layout.block.address)
 
-        position, moving = told("position"), told("moving")
-        if moving > 1 or told("status") & ~KNOWN_ERRORS or not self._is_possible(position):
+        position, moving = reported("position"), reported("moving")
+        if moving > 1 or reported("status") & ~KNOWN_ERRORS or not self._is_possible(position):
             return None
-        if not self._is_steady(told("voltage"), told("temperature")):
+        if not self._is_steady(reported("voltage"), reported("temperature")):
             return None
-        amperes = None if model.current_unit is None else told("current") * model.current_unit
+        amperes = None if model.current_unit is None else reported("current") * model.current_unit
         return Sample(
-            question=self.question(answer),
+            request_key=self.request_key(answer),
             expected=answer.earliest,
             earliest=answer.earliest,
             latest=answer.latest,
             ticks=position,
-            velocity=told("velocity") * model.velocity_unit,
+            velocity=reported("velocity") * model.velocity_unit,
             current=amperes,
             moving=bool(moving),
             alert=answer.status.error != 0,
@@ -150,24 +150,24 @@ class Bus(ServoBus):
         return PACKETS
 
 
-def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[Way]]:
+def read_methods_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[ReadMethod]]:
     """Return the read methods of each group: the STS and SMS series, which support Sync Read, and the others."""
-    together = [servo for servo in servos if servo.model.protocol == STS]
-    if len(together) < 2 or config.sync_read != "auto":
+    sync_read = [servo for servo in servos if servo.model.protocol == STS]
+    if len(sync_read) < 2 or config.sync_read != "auto":
         return [[one_by_one(bus, servos)]]
     alone = [servo for servo in servos if servo.model.protocol != STS]
-    layout, ids = together[0].model.layout, tuple(servo.id for servo in together)
+    layout, ids = sync_read[0].model.layout, tuple(servo.id for servo in sync_read)
     block = layout.block
 
     def packet(size: int) -> bytes:
         return PACKETS.sync_read(ids, block.address, size)
 
     request = Request(packet, ids, block.size, STS, spare_after(layout, block))
-    groups = [[Way("Sync Read", (request,), SYNC_READ_FAILED), one_by_one(bus, together)]]
+    groups = [[ReadMethod("Sync Read", (request,), SYNC_READ_FAILED), one_by_one(bus, sync_read)]]
     return [*groups, [one_by_one(bus, alone)]] if alone else groups
 
 
-FEETECH = ServoVendor(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, -1)
+FEETECH = ServoVendor(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, read_methods_of, settings_of, -1)
 
 
 class FeetechJoints(ServoJoints):

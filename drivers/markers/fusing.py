@@ -32,7 +32,7 @@ class _Settings:
     hand_m_s2: float = 2.0
     # common positions for the verdict on a source
     judged: int = 300
-    fewest_judged: int = 30
+    min_judged: int = 30
     # share of disagreeing positions that is reported; by chance it is 0.001
     many: float = 0.05
     # a rigid transform explains a disagreement that it brings below this multiple of the usual chi²
@@ -49,7 +49,7 @@ CHI2_999, CHI2_MEDIAN = 16.27, 2.37  # of 3 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
-class Common:
+class PositionPair:
     """Positions of two sources at one time."""
 
     # lead, other: positions [m], (3,)
@@ -60,8 +60,8 @@ class Common:
     @property
     def chi2(self) -> float:
         """Squared Mahalanobis distance of the two."""
-        apart = self.other - self.lead
-        return float(apart @ np.linalg.solve(self.cov, apart))
+        difference = self.other - self.lead
+        return float(difference @ np.linalg.solve(self.cov, difference))
 
 
 class Member:
@@ -79,7 +79,7 @@ class Member:
 
         self.name, self.source, self.pose = name, source, pose
         self._turn = Rotation.from_matrix(pose[:3, :3])
-        self.common: deque[Common] = deque(maxlen=_Settings.judged)
+        self.common: deque[PositionPair] = deque(maxlen=_Settings.judged)
         self.forget()
 
     def forget(self) -> None:
@@ -115,20 +115,20 @@ class Member:
     def verdict(self, leader: str) -> str | None:
         """Describe the disagreement of its positions with the leader's, with the remedy; return None if they agree."""
         common = list(self.common)  # another thread may add to it
-        if len(common) < _Settings.fewest_judged:
+        if len(common) < _Settings.min_judged:
             return None
         chi2 = np.array([pair.chi2 for pair in common])
         share = float((chi2 > CHI2_999).mean())
         if share < _Settings.many:
             return None
-        apart = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in common]))
+        gap_m = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in common]))
         return (
             f"{leader} and {self.name} disagree in {100 * share:.0f} % of {len(chi2)} common positions, by "
-            f"{1e3 * apart:.1f} mm in the median, which is {math.sqrt(float(np.median(chi2)) / CHI2_MEDIAN):.1f} times "
+            f"{1e3 * gap_m:.1f} mm in the median, which is {math.sqrt(float(np.median(chi2)) / CHI2_MEDIAN):.1f} times "
             f"what their uncertainties allow: {self._remedy(common)}"
         )
 
-    def _remedy(self, common: Sequence[Common]) -> str:
+    def _remedy(self, common: Sequence[PositionPair]) -> str:
         lead, other = (np.array([getattr(pair, side) for pair in common]) for side in ("lead", "other"))
         T, spread = _rigid(other, lead)
         if spread < _Settings.spread_m:
@@ -223,8 +223,8 @@ class FusedMarkers:
             leader.waiting.popleft()
         if not leader.waiting:
             return None
-        fix, came = leader.waiting[0]
-        if now - came < _Settings.longest_wait_s and any(other.newest_t < fix.t for other in others):
+        fix, arrived = leader.waiting[0]
+        if now - arrived < _Settings.longest_wait_s and any(other.newest_t < fix.t for other in others):
             return None
         leader.waiting.popleft()
         return self._fused(leader, fix, others)
@@ -236,36 +236,36 @@ class FusedMarkers:
             if at is None:
                 continue
             if leader is self.members[0]:
-                other.common.append(Common(fix.x, at[0], fix.cov + at[1]))
+                other.common.append(PositionPair(fix.x, at[0], fix.cov + at[1]))
             found.append(at)
-        agreeing = _agreeing(found)
-        if not agreeing:
+        consistent = _consistent(found)
+        if not consistent:
             return MarkerMiss(fix.t, Reason.DISAGREEING)
         if len(found) == 1:
             return fix
-        x, cov = _mean(agreeing)
+        x, cov = _mean(consistent)
         return replace(fix, x=frozen_array(x), cov=frozen_array(cov), centres_px=None)
 
 
 Positions = list[tuple[FloatArray, FloatArray]]
 
 
-def _agreeing(found: Positions) -> Positions:
+def _consistent(found: Positions) -> Positions:
     """Return the positions that agree with the mean of the others, after removing the worst until all do.
 
     Return nothing if no two agree.
     """
-    left = list(found)
-    while len(left) > 1:
+    remaining = list(found)
+    while len(remaining) > 1:
         chi2 = []
-        for place, (x, cov) in enumerate(left):
-            mean, of_mean = _mean(left[:place] + left[place + 1 :])
-            chi2.append(Common(mean, x, cov + of_mean).chi2)
+        for place, (x, cov) in enumerate(remaining):
+            mean, of_mean = _mean(remaining[:place] + remaining[place + 1 :])
+            chi2.append(PositionPair(mean, x, cov + of_mean).chi2)
         worst = int(np.argmax(chi2))
         if chi2[worst] < CHI2_999:
-            return left
-        del left[worst]
-    return left if len(found) == 1 else []
+            return remaining
+        del remaining[worst]
+    return remaining if len(found) == 1 else []
 
 
 def _mean(found: Positions) -> tuple[FloatArray, FloatArray]:

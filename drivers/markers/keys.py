@@ -122,14 +122,14 @@ class KeyReceiver:
         if isinstance(self._table, ZenohTable):
             return f"let a program publish on the key {self._key} at {self._table.router}"
         topics = [] if self._link is None else list(rmw.topics_in(list(self._link.tokens())))
-        wanted = "/" + self._table.topic.strip("/")
-        types = {topic.type for topic in topics if topic.name == wanted}
+        topic_name = "/" + self._table.topic.strip("/")
+        types = {topic.type for topic in topics if topic.name == topic_name}
         if types and TYPES[self._table.message] not in types:
-            return f"{wanted} is a topic of {', '.join(sorted(types))}: correct message in [marker_source]"
-        alike = sorted({topic.name for topic in topics if topic.type == TYPES[self._table.message]} - {wanted})
-        if alike:
-            return f"there are such messages on {', '.join(alike)}: correct topic in [marker_source]"
-        return f"start the node that publishes {wanted}, on the router {self._table.router}"
+            return f"{topic_name} is a topic of {', '.join(sorted(types))}: correct message in [marker_source]"
+        same_type = sorted({topic.name for topic in topics if topic.type == TYPES[self._table.message]} - {topic_name})
+        if same_type:
+            return f"there are such messages on {', '.join(same_type)}: correct topic in [marker_source]"
+        return f"start the node that publishes {topic_name}, on the router {self._table.router}"
 
 
 def topic_receiver(table: Ros2Table, clock: Clock) -> tuple[KeyReceiver, Callable[[bytes, bytes], Iterable[Report]]]:

@@ -28,7 +28,7 @@ class _Settings:
     # A share of faulty messages below this costs no pairs worth a message to a person.
     many: float = 0.02
     # The first messages of a clock that is not known yet may be refused.
-    worth_a_word: int = 4
+    min_to_report: int = 4
     # with unit = "mm": metres, divided by 1000, are all nearer to the origin
     nearest_m: float = 0.005
     # a wider covariance is in mm², or useless
@@ -47,7 +47,7 @@ class _Settings:
 USED = "used"
 
 
-class Ledger:
+class MessageCounters:
     """Counters of used and unused messages, in total and of the last `lately_s`; for any thread."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class Ledger:
             self.total[what] += count
             if isinstance(what, Fault) and detail:
                 self._details[what] = detail
-            return self.total[what] - count < _Settings.worth_a_word <= self.total[what]
+            return self.total[what] - count < _Settings.min_to_report <= self.total[what]
 
     def lately(self, now: float) -> Counter[str]:
         """Return the counts of the last seconds."""
@@ -82,14 +82,14 @@ class Ledger:
         """Yield the faults of the messages of the last seconds, with the remedy."""
         counts = self.lately(now)
         # Other bodies matter only if the marker's own is missing; a hidden marker counts as a rejected fix.
-        usual = {Fault.NOT_TRACKED} | ({Fault.OTHER_BODY} if counts[USED] or counts[Fault.NOT_TRACKED] else set())
-        whole = sum(count for what, count in counts.items() if what not in usual)
+        ignored = {Fault.NOT_TRACKED} | ({Fault.OTHER_BODY} if counts[USED] or counts[Fault.NOT_TRACKED] else set())
+        total = sum(count for what, count in counts.items() if what not in ignored)
         for fault in Fault:
-            if fault in usual or counts[fault] <= _Settings.many * whole:
+            if fault in ignored or counts[fault] <= _Settings.many * total:
                 continue
-            yield f"{name}: {counts[fault]} of the last {whole} messages {self.explained(fault)}"
+            yield f"{name}: {counts[fault]} of the last {total} messages {self.describe(fault)}"
 
-    def explained(self, fault: Fault) -> str:
+    def describe(self, fault: Fault) -> str:
         """Return the description of a fault, with its newest detail and the remedy."""
         what, remedy = ADVICE[fault]
         detail = self._details.get(fault, "")
@@ -135,17 +135,17 @@ class MarkerStream:
         self.name = table.label
         self._is_open = False
         self._last_t = -math.inf
-        self.ledger = Ledger()
+        self.ledger = MessageCounters()
         self._forget()
 
     @property
     def health(self) -> tuple[str, ...]:
         """Current problems, each with its remedy."""
         now = self._clock.now()
-        said, silence = list(self.ledger.complaints(now, self.name)), self._silence
+        messages, silence = list(self.ledger.complaints(now, self.name)), self._silence
         if self._is_open and silence is not None:
-            said.append(f"{self.name}: no message for {now - self._heard:.0f} s: {silence}")
-        return tuple(said)
+            messages.append(f"{self.name}: no message for {now - self._heard:.0f} s: {silence}")
+        return tuple(messages)
 
     def __enter__(self) -> Self:
         self._receiver.open()
@@ -214,7 +214,7 @@ class MarkerStream:
 
     def _refuse(self, t: float, fault: Fault, detail: str) -> None:
         if self.ledger.note(t, fault, detail) and fault != Fault.OTHER_BODY:
-            log.warning("%s: a message was not used; such messages %s", self.name, self.ledger.explained(fault))
+            log.warning("%s: a message was not used; such messages %s", self.name, self.ledger.describe(fault))
 
     def _fix(self, report: Report, packet: Packet) -> MarkerFix | MarkerMiss:
         arrived = packet.arrived
@@ -294,7 +294,7 @@ class MarkerStream:
         lost, order = numbers.count(seq, self._unread)
         self._unread = 0
         if lost and packet.sender == self._sender and self.ledger.note(packet.arrived, Fault.LOST, count=lost):
-            log.warning("%s: %d messages %s", self.name, lost, self.ledger.explained(Fault.LOST))
+            log.warning("%s: %d messages %s", self.name, lost, self.ledger.describe(Fault.LOST))
         return order
 
     def _position(self, sent: tuple[float, ...]) -> FloatArray:
@@ -412,6 +412,8 @@ def _of_fixes(subject: str, fixes: list[MarkerFix]) -> Iterator[Check]:
     rate = (len(fixes) - 1) / max(last.t - fixes[0].t, Waits.poll_s)
     place = ", ".join(f"{1e3 * value:.1f}" for value in last.x)
     sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(last.cov)[-1]))
-    said = f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"
+    message = (
+        f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"
+    )
     fix = "let the source send more often: 30 to 100 a second"
-    yield warned(subject, said, fix, when=rate < _Settings.few_per_s)
+    yield warned(subject, message, fix, when=rate < _Settings.few_per_s)

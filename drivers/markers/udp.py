@@ -108,7 +108,7 @@ class UdpReceiver:
     def silence(self) -> str:
         if self._strangers:
             return f"{self._strangers} datagrams came from other addresses than sender: correct sender"
-        said = f"start the program that sends to port {self._table.port} of {self._table.host}"
+        advice = f"start the program that sends to port {self._table.port} of {self._table.host}"
         if self._table.host.startswith("127."):
-            return f'{said}; from another machine only host = "0.0.0.0" takes them'
-        return f"{said}; does the firewall let them in?"
+            return f'{advice}; from another machine only host = "0.0.0.0" takes them'
+        return f"{advice}; does the firewall let them in?"

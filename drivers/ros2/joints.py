@@ -17,7 +17,7 @@ from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.link import Link, LinkSettings, OpenLink, Sample, open_zenoh
 from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state
-from bodyschema.drivers.ros2.senders import Gates, Refusal, Sender
+from bodyschema.drivers.ros2.senders import Refusal, Sender, SpeedGates
 from bodyschema.drivers.turns import FASTEST_M_S, FASTEST_RAD_S
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
@@ -36,7 +36,7 @@ class _Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Merged:
+class MergedJoints:
     """All joints at one time."""
 
     t: float  # the time of a message [s], never between two messages
@@ -54,7 +54,7 @@ class _Point:
     q: float
 
 
-class Merging:
+class JointMerger:
     """Buffer of the positions of each joint since the last reading.
 
     The next reading is at the time of the newest message of the joint that was updated least recently. The other joints
@@ -64,13 +64,15 @@ class Merging:
     def __init__(self, joints: int) -> None:
         """Start with empty buffers for `joints` joints."""
         self._tracks: list[deque[_Point]] = [deque(maxlen=_Settings.points_kept) for _ in range(joints)]
-        self._told = float("-inf")
+        self._last_t = float("-inf")
 
     def missing(self) -> list[int]:
         """Return the joints without any position so far."""
         return [place for place, track in enumerate(self._tracks) if not track]
 
-    def put(self, t: float, sigma_s: float, stamp_ns: int, places: Sequence[int], q: Sequence[float]) -> Merged | None:
+    def put(
+        self, t: float, sigma_s: float, stamp_ns: int, places: Sequence[int], q: Sequence[float]
+    ) -> MergedJoints | None:
         """Add positions `q` of the joints at `places`; return the reading that they complete."""
         for place, value in zip(places, q, strict=True):
             track = self._tracks[place]
@@ -79,15 +81,17 @@ class Merging:
         if self.missing():
             return None
         slowest = min((track[-1] for track in self._tracks), key=lambda point: point.t)
-        if slowest.t <= self._told:
+        if slowest.t <= self._last_t:
             return None
         found = [_at(slowest.t, track) for track in self._tracks]
         if any(part is None for part in found):
             return None
-        self._told = slowest.t
+        self._last_t = slowest.t
         parts = [part for part in found if part is not None]
         sigma_s = max(track[0].sigma_s for track in self._tracks)
-        return Merged(slowest.t, slowest.stamp_ns, tuple(q for q, _ in parts), max(gap for _, gap in parts), sigma_s)
+        return MergedJoints(
+            slowest.t, slowest.stamp_ns, tuple(q for q, _ in parts), max(gap for _, gap in parts), sigma_s
+        )
 
 
 def _at(t: float, track: deque[_Point]) -> tuple[float, float] | None:
@@ -148,30 +152,30 @@ def silence(
         )
     if names:
         return f"{config.topic} has fallen silent; see whether the robot publishes: ros2 topic hz {config.topic}"
-    return _unheard(config, list(rmw.topics_in(list(tokens()))))
+    return _why_unheard(config, list(rmw.topics_in(list(tokens()))))
 
 
-def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
-    wanted = "/" + config.topic.strip("/")
+def _why_unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
+    name = "/" + config.topic.strip("/")
     if config.via == "ros2dds":
         return (
-            f"the bridge at {config.router} passes on nothing of {wanted}; see whether the robot publishes it in the "
-            f"bridge's domain: ros2 topic hz {wanted}"
+            f"the bridge at {config.router} passes on nothing of {name}; see whether the robot publishes it in the "
+            f"bridge's domain: ros2 topic hz {name}"
         )
-    here = [topic for topic in topics if topic.domain == config.domain]
-    other_types = {topic.type for topic in here if topic.name == wanted} - {JOINT_STATE.name}
+    in_domain = [topic for topic in topics if topic.domain == config.domain]
+    other_types = {topic.type for topic in in_domain if topic.name == name} - {JOINT_STATE.name}
     if other_types:
-        return f"{wanted} is no topic of sensor_msgs/JointState but of {', '.join(sorted(other_types))}; fix topic"
-    if any(topic.name == wanted for topic in here):
-        return f"a node publishes {wanted}, but says nothing; see whether the robot runs: ros2 topic hz {wanted}"
-    elsewhere = sorted({topic.domain for topic in topics if topic.name == wanted})
+        return f"{name} is no topic of sensor_msgs/JointState but of {', '.join(sorted(other_types))}; fix topic"
+    if any(topic.name == name for topic in in_domain):
+        return f"a node publishes {name}, but says nothing; see whether the robot runs: ros2 topic hz {name}"
+    elsewhere = sorted({topic.domain for topic in topics if topic.name == name})
     if elsewhere:
-        return f"{wanted} is published in the domain {elsewhere[0]}, not {config.domain}; fix domain"
-    others = sorted({topic.name for topic in here if topic.type == JOINT_STATE.name})[: _Settings.most_shown]
+        return f"{name} is published in the domain {elsewhere[0]}, not {config.domain}; fix domain"
+    others = sorted({topic.name for topic in in_domain if topic.type == JOINT_STATE.name})[: _Settings.most_shown]
     if others:
-        return f"nothing publishes {wanted}; there are joint states on {', '.join(others)}. Fix topic"
+        return f"nothing publishes {name}; there are joint states on {', '.join(others)}. Fix topic"
     return (
-        f"nothing publishes {wanted} at the router {config.router}; start the robot with "
+        f"nothing publishes {name} at the router {config.router}; start the robot with "
         "RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its nodes with the same router"
     )
 
@@ -179,7 +183,7 @@ def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
 log = logging.getLogger(__name__)
 
 
-Who = bytes | tuple[str, ...]
+SenderKey = bytes | tuple[str, ...]
 
 
 class Ros2Joints:
@@ -206,7 +210,7 @@ class Ros2Joints:
         open_link: OpenLink = open_zenoh,
     ) -> None:
         self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
-        self._wanted = config.ros_names(joints)
+        self._ros_names = config.ros_names(joints)
         slides = [False] * len(joints) if prismatic is None else list(prismatic)
         self._fastest = [FASTEST_M_S if sliding else FASTEST_RAD_S for sliding in slides]
         self._slack = [_Settings.slack_m if sliding else _Settings.slack_rad for sliding in slides]
@@ -256,13 +260,13 @@ class Ros2Joints:
 
     def _forget(self) -> None:
         """Reset everything learnt from earlier messages."""
-        self._senders: dict[Who, Sender] = {}
-        self._gates = Gates(self._fastest, self._slack)
-        self._owners: list[tuple[Who, float] | None] = [None] * len(self.joints)
+        self._senders: dict[SenderKey, Sender] = {}
+        self._gates = SpeedGates(self._fastest, self._slack)
+        self._owners: list[tuple[SenderKey, float] | None] = [None] * len(self.joints)
         self._sequences: dict[bytes, int] = {}
-        self._merging = Merging(len(self.joints))
+        self._merger = JointMerger(len(self.joints))
         self._names: set[str] = set()
-        self._said: set[Refusal] = set()
+        self._logged: set[Refusal] = set()
         self._lately: Counter[Refusal] = Counter()
         self._complaint: str | None = None
         self._read_at = self._clock.now()
@@ -278,7 +282,7 @@ class Ros2Joints:
         self._count_lost(gid, sequence)
         if len(self._names) < _Settings.most_names:
             self._names.update(message.names)
-        merged = self._believed(gid or message.names, message, sample.arrived)
+        merged = self._accepted(gid or message.names, message, sample.arrived)
         if merged is None:
             return None
         if merged.gap_s > _Settings.most_gap_s:
@@ -289,32 +293,34 @@ class Ros2Joints:
         self._last_t, self.stamp_ns = merged.t, merged.stamp_ns
         return JointReading(merged.t, frozen_array(merged.q), merged.sigma_s)
 
-    def _believed(self, who: Who, message: JointState, arrived: float) -> Merged | None:
+    def _accepted(self, who: SenderKey, message: JointState, arrived: float) -> MergedJoints | None:
         columns = {name: column for column, name in enumerate(message.names)}
-        places = [place for place, name in enumerate(self._wanted) if name in columns]
+        places = [place for place, name in enumerate(self._ros_names) if name in columns]
         if not places:
             return None
-        told = self._told(who, message, places, arrived)
-        if isinstance(told, Refusal):
-            self._refuse(told, self._wanted[places[0]])
+        t = self._stamp_time(who, message, places, arrived)
+        if isinstance(t, Refusal):
+            self._refuse(t, self._ros_names[places[0]])
             return None
-        q = [message.positions[columns[self._wanted[place]]] for place in places]
+        q = [message.positions[columns[self._ros_names[place]]] for place in places]
         if not all(map(math.isfinite, q)):
-            self._refuse(Refusal.NOT_FINITE, self._wanted[places[0]])
+            self._refuse(Refusal.NOT_FINITE, self._ros_names[places[0]])
             return None
         for place in places:
             self._owners[place] = who, arrived
-        verdict = self._gates.offer(told, places, q)
+        verdict = self._gates.offer(t, places, q)
         if self._gates.jumped:
             raise SourceLost(
                 "a joint is suddenly somewhere else, or the names were changed", retry_s=LinkSettings.retry_s
             )
         if verdict is False:
-            self._refuse(Refusal.TOO_FAST, self._wanted[places[0]])
+            self._refuse(Refusal.TOO_FAST, self._ros_names[places[0]])
         sigma_s = self._sender(who).sigma_s
-        return self._merging.put(told, sigma_s, message.header.stamp_ns, places, q) if verdict else None
+        return self._merger.put(t, sigma_s, message.header.stamp_ns, places, q) if verdict else None
 
-    def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
+    def _stamp_time(
+        self, who: SenderKey, message: JointState, places: Sequence[int], arrived: float
+    ) -> float | Refusal:
         """Return the time of the message's positions [s], or the reason to reject it."""
         owners = [owner for place in places if (owner := self._owners[place]) is not None]
         if any(owner != who and arrived - heard < Waits.rival_after_s for owner, heard in owners):
@@ -330,7 +336,7 @@ class Ros2Joints:
             log.warning("the clock of the stamps in %s was set; its time is learnt again", self._config.topic)
         return t
 
-    def _sender(self, who: Who) -> Sender:
+    def _sender(self, who: SenderKey) -> Sender:
         sender = self._senders.get(who)
         if sender is None:
             if len(self._senders) >= _Settings.most_senders:
@@ -350,15 +356,15 @@ class Ros2Joints:
     def _refuse(self, why: Refusal, detail: str) -> None:
         self.refused[why] += 1
         self._lately[why] += 1
-        if why not in self._said:
-            self._said.add(why)
+        if why not in self._logged:
+            self._logged.add(why)
             log.warning("a message of %s was not used (%s): %s", self._config.topic, detail, ADVICE[why])
 
     def _complain(self, link: Link) -> None:
         """Report once why there are no readings."""
         if self._complaint is not None or self._clock.now() - self._read_at < Waits.silent_after_s:
             return
-        missing = [self._wanted[place] for place in self._merging.missing()]
+        missing = [self._ros_names[place] for place in self._merger.missing()]
         self._complaint = silence(self._config, missing, self._names, self._lately, link.tokens)
         log.warning("%s", self._complaint)
 
@@ -383,7 +389,7 @@ def joint_state_checks(
         with Ros2Joints(config, joints, clock, prismatic=prismatic, open_link=open_link) as robot:
             yield Check("router", "ok", f"{config.router} answers")
             if not _begins(robot, clock):
-                yield Check("joint states", "wrong", *_parted(robot.health))
+                yield Check("joint states", "wrong", *_split_remedy(robot.health))
                 return
             yield Check("joint states", "ok", f"all {len(joints)} joints of robot.toml are in {config.topic}")
             lost, heard = _lost_and_sent(robot)
@@ -395,10 +401,10 @@ def joint_state_checks(
             fix = "let the robot's nodes publish more often"
             yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _Settings.few_per_s)
             fix = "bodyschema watch joints    # its log says why, once for each reason"
-            said = f"{lost} of {messages} messages were lost or not used"
-            yield warned("errors", said, fix, when=lost > CheckSettings.many_troubles * messages)
+            message = f"{lost} of {messages} messages were lost or not used"
+            yield warned("errors", message, fix, when=lost > CheckSettings.many_troubles * messages)
     except SourceError as error:
-        yield Check("router", "wrong", *_parted((str(error),)))
+        yield Check("router", "wrong", *_split_remedy((str(error),)))
 
 
 def _begins(robot: Ros2Joints, clock: Clock) -> bool:
@@ -410,12 +416,12 @@ def _begins(robot: Ros2Joints, clock: Clock) -> bool:
     return False
 
 
-def _parted(complaints: Sequence[str]) -> tuple[str, str]:
+def _split_remedy(complaints: Sequence[str]) -> tuple[str, str]:
     """Split a complaint into the finding and its last part, the remedy."""
     if not complaints:
         return "too few joint states come", "let the robot's nodes publish more often"
-    *said, fix = LAST_PART.split(complaints[0])
-    return "".join(said), fix
+    *finding, fix = LAST_PART.split(complaints[0])
+    return "".join(finding), fix
 
 
 def _lost_and_sent(robot: Ros2Joints) -> tuple[int, int]:

@@ -28,13 +28,13 @@ class _Settings:
     # for this long, then the first message's stamp was wrong
     late_for_s: float = 1.0
     # messages used to estimate the scatter of delays
-    lately: int = 51
+    window: int = 51
     # unobservable transit time of the fastest message: 0.2 ms on the loopback interface
     quickest_sigma_s: float = 0.5e-3
     # times advance at half speed at least after a faster message shows that all others were late
     steady: float = 0.5
     # consecutive stamps that all disagree with the clock
-    anew_after: int = 3
+    restart_after: int = 3
     # if they are late by less, the network was probably held up
     stall_s: float = 5.0
     anew_after_s: float = 0.5  # for this long: the sender's clock was set
@@ -53,7 +53,7 @@ class StampClock:
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
         self._early: list[float] = []
-        self._delays: deque[float] = deque(maxlen=_Settings.lately)
+        self._delays: deque[float] = deque(maxlen=_Settings.window)
         self._least_s = self._began = math.inf
         self._begin(0)
 
@@ -162,7 +162,7 @@ class Sender:
         self._max_delay_s = max_delay_s
         self._clock = StampClock(max_delay_s)
         self._newest_ns: dict[int, int] = {}
-        self._astray: list[tuple[float, float]] = []
+        self._disagreeing: list[tuple[float, float]] = []
 
     @property
     def sigma_s(self) -> float:
@@ -174,32 +174,32 @@ class Sender:
         self.heard = arrived
         if stamp_ns == 0:
             return Refusal.NO_STAMP
-        told_ns = [self._newest_ns[place] for place in places if place in self._newest_ns]
-        if stamp_ns in told_ns:
+        newest_stamps_ns = [self._newest_ns[place] for place in places if place in self._newest_ns]
+        if stamp_ns in newest_stamps_ns:
             return Refusal.DUPLICATE
-        if any(stamp_ns < newest_ns for newest_ns in told_ns):
-            return self._astray_at(stamp_ns, arrived, Refusal.OUT_OF_ORDER)
+        if any(stamp_ns < newest_ns for newest_ns in newest_stamps_ns):
+            return self._note_disagreeing(stamp_ns, arrived, Refusal.OUT_OF_ORDER)
         t = self._clock.time_of(stamp_ns, arrived)
         if t is None:
-            return self._astray_at(stamp_ns, arrived, Refusal.DELAYED)
+            return self._note_disagreeing(stamp_ns, arrived, Refusal.DELAYED)
         self._newest_ns.update(dict.fromkeys(places, stamp_ns))
-        self._astray.clear()
+        self._disagreeing.clear()
         return t
 
-    def _astray_at(self, stamp_ns: int, arrived: float, refusal: Refusal) -> Refusal:
+    def _note_disagreeing(self, stamp_ns: int, arrived: float, refusal: Refusal) -> Refusal:
         """Restart the clock if only such messages arrive, all off by the same amount: the sender's clock was set."""
         off_s = self._clock.lateness_s(stamp_ns, arrived)
-        if self._astray and abs(off_s - self._astray[0][1]) > self._max_delay_s:
-            self._astray.clear()
-        self._astray = [*self._astray[: _Settings.anew_after - 1], (arrived, off_s)]
+        if self._disagreeing and abs(off_s - self._disagreeing[0][1]) > self._max_delay_s:
+            self._disagreeing.clear()
+        self._disagreeing = [*self._disagreeing[: _Settings.restart_after - 1], (arrived, off_s)]
         patience_s = _Settings.anew_after_stall_s if 0 < off_s < _Settings.stall_s else _Settings.anew_after_s
-        if len(self._astray) == _Settings.anew_after and arrived - self._astray[0][0] > patience_s:
-            self._clock, self._newest_ns, self._astray = StampClock(self._max_delay_s), {}, []
+        if len(self._disagreeing) == _Settings.restart_after and arrived - self._disagreeing[0][0] > patience_s:
+            self._clock, self._newest_ns, self._disagreeing = StampClock(self._max_delay_s), {}, []
             self.times_set += 1
         return refusal
 
 
-class Gates:
+class SpeedGates:
     """Speed gates, one per joint; the first positions are confirmed by the next message."""
 
     def __init__(self, fastest: Sequence[float], slack: Sequence[float]) -> None:

@@ -80,7 +80,7 @@ class Board:
         self._cutter, self._delay_s = LineCutter(byte_s), delay_s
         self._clock = StreamClock(STAMP_S, STAMPS)
         self._seq: int | None = None
-        self._doubts = 0
+        self._implausible = 0
         self._readings: deque[Timed] = deque()
 
     def hear(self, data: bytes, arrived: float) -> None:
@@ -89,14 +89,14 @@ class Board:
         self.counts.garbled += overlong
         for line, begun in lines:
             try:
-                said = parse(line)
+                parsed = parse(line)
             except GarbledLine:
                 self.counts.garbled += 1
                 continue
-            if isinstance(said, Header):
-                self._introduce(said)
+            if isinstance(parsed, Header):
+                self._introduce(parsed)
             else:
-                self._take(said, begun)
+                self._take(parsed, begun)
 
     @property
     def is_waiting(self) -> bool:
@@ -120,17 +120,17 @@ class Board:
             ahead = (reading.seq - self._seq) % SEQUENCES
             if not 0 < ahead < SEQUENCES // 2:
                 self.counts.out_of_order += 1
-                self._doubt()
+                self._note_implausible()
                 return
             self.counts.missing += ahead - 1
         t = self._clock.time(begun, reading.t_us)
         if t is None:
-            self._doubt()
+            self._note_implausible()
             return
-        self._seq, self._doubts = reading.seq, 0
+        self._seq, self._implausible = reading.seq, 0
         self.counts.lines += 1
         self._readings.append(Timed(t - self._delay_s, self._clock.sigma_s, reading))
 
-    def _doubt(self) -> None:
-        self._doubts += 1
-        self.restarted = self.restarted or self._doubts >= DOUBTS
+    def _note_implausible(self) -> None:
+        self._implausible += 1
+        self.restarted = self.restarted or self._implausible >= DOUBTS

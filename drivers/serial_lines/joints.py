@@ -99,14 +99,14 @@ class SerialLineJoints:
     ) -> None:
         self._config, self.joints, self._clock, self._open_port = config, tuple(joints), clock, open_port
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
-        self._wanted = [by_joint[joint] for joint in joints]
+        self._configured = [by_joint[joint] for joint in joints]
         unlimited = [(-math.inf, math.inf)] * len(joints)
         self._turns = TurnCount(limits or unlimited, last_pose)
         self._port: Port | None = None
         self._board = Board(0.0, 0.0)
-        self._last_t = self._believed_s = self._heard_s = -math.inf
+        self._last_t = self._accepted_s = self._heard_s = -math.inf
         self._attempts = 0
-        self._why, self._failing = "", set[str]()
+        self._last_error, self._failing = "", set[str]()
         self.encoders: list[Encoder] = []
         self.epoch = self.dropped = 0
 
@@ -171,9 +171,9 @@ class SerialLineJoints:
         deadline = self._clock.now() + timeout_s
         while True:
             while (timed := self._board.next()) is not None:
-                reading = self._judge(timed)
+                reading = self._accepted(timed)
                 if reading is not None:
-                    self._believed_s, self._attempts = self._clock.now(), 0
+                    self._accepted_s, self._attempts = self._clock.now(), 0
                     return reading
                 self.dropped += 1
             self._hear(self._port, deadline)
@@ -193,7 +193,7 @@ class SerialLineJoints:
             [2 + encoder.ticks_per_turn / _Settings.slack_ticks_part for encoder in self.encoders],
         )
         self._anchor(port)
-        self._believed_s = self._heard_s = self._clock.now()
+        self._accepted_s = self._heard_s = self._clock.now()
         self._attempts = 0
 
     def _introduced(self, port: Port) -> Header:
@@ -215,42 +215,42 @@ class SerialLineJoints:
         """Return the encoders; raise SourceError with a table of all if one differs from robot.toml."""
         rows, encoders = [("joint", "encoder", "expected", "found")], list[Encoder]()
         places = list(header.encoders)
-        for config in self._wanted:
+        for config in self._configured:
             announced, expected = header.encoders.get(config.name), config.ticks_per_turn
             rows.append((config.joint, config.name, _ticks(expected, "any"), _ticks(announced, "not announced")))
             if announced is not None and expected in (None, announced):
                 encoders.append(Encoder(config, places.index(config.name), announced))
-        if len(encoders) == len(self._wanted):
+        if len(encoders) == len(self._configured):
             return encoders
         what = f"the encoders on {self._config.port} are not those of robot.toml:"
         raise SourceError("\n  ".join([what, *aligned(rows), f"announced are: {', '.join(places)}"]))
 
     def _anchor(self, port: Port) -> None:
         """Find the turn of each joint from two consistent readings; wait until the times are accurate."""
-        end, believed = self._clock.now() + _Settings.anchor_s, 0
-        self._why = "no line"
+        end, agreeing = self._clock.now() + _Settings.anchor_s, 0
+        self._last_error = "no line"
         while self._clock.now() < end:
             while (timed := self._board.next()) is not None:
                 raw = self._raw(timed)
                 if raw is None:
                     continue
-                if believed == 0:
+                if agreeing == 0:
                     self._turns.begin(self.encoders, raw)
-                counts = self._turns.continued(raw)
-                believed = believed + 1 if self._gate.offer(timed.t, counts) is None else 0
-                if believed >= 2:
+                counts = self._turns.unwrapped(raw)
+                agreeing = agreeing + 1 if self._gate.offer(timed.t, counts) is None else 0
+                if agreeing >= 2:
                     self._turns.counts = counts
-                if believed == 2:
+                if agreeing == 2:
                     self._turns.check(raw)
-                if believed >= 2 and self._is_sure(timed):
+                if agreeing >= 2 and self._has_accurate_time(timed):
                     return
             self._board.hear(port.receive(end), self._clock.now())
-        raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=SerialLineSettings.retry_s)
+        raise SourceLost(f"the encoders cannot be read: {self._last_error}", retry_s=SerialLineSettings.retry_s)
 
     # --- reading
 
     def _hear(self, port: Port, deadline: float) -> None:
-        lost_at = self._believed_s + LOST_AFTER_S
+        lost_at = self._accepted_s + LOST_AFTER_S
         data = port.receive(min(deadline, max(lost_at, self._clock.now() + LOST_AFTER_S / _Settings.few_attempts)))
         garbled = self.counts.garbled
         self._board.hear(data, self._clock.now())
@@ -259,12 +259,12 @@ class SerialLineJoints:
         if data:
             self._heard_s = self._clock.now()
         if self.counts.garbled > garbled:
-            self._why = "a garbled line"
+            self._last_error = "a garbled line"
         elif self._clock.now() - self._heard_s > LOST_AFTER_S:
-            self._why = "no line"
+            self._last_error = "no line"
         self._attempts += 1
         if self._clock.now() > lost_at and self._attempts >= _Settings.few_attempts and not self._board.is_waiting:
-            raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=SerialLineSettings.retry_s)
+            raise SourceLost(f"the encoders cannot be read: {self._last_error}", retry_s=SerialLineSettings.retry_s)
 
     def _raw(self, timed: Timed) -> list[int] | None:
         """Return the raw positions of the joints; None if an encoder has no value."""
@@ -273,29 +273,29 @@ class SerialLineJoints:
         raw = [tick for tick in ticks if tick is not None]
         return raw if len(raw) == len(ticks) else None
 
-    def _judge(self, timed: Timed) -> JointReading | None:
+    def _accepted(self, timed: Timed) -> JointReading | None:
         raw = self._raw(timed)
         if raw is None:
             return None
-        if not self._is_sure(timed):
-            self._believed_s = self._clock.now()  # no encoder is missing
+        if not self._has_accurate_time(timed):
+            self._accepted_s = self._clock.now()  # no encoder is missing
             return None
-        counts = self._turns.continued(raw)
-        refused = self._gate.offer(timed.t, counts)
-        if refused is not None:
-            self._why = f"joint {self.joints[refused]!r}: a position where it cannot have come to"
+        counts = self._turns.unwrapped(raw)
+        rejected = self._gate.offer(timed.t, counts)
+        if rejected is not None:
+            self._last_error = f"joint {self.joints[rejected]!r}: a position where it cannot have come to"
             if self._gate.jumped:
-                raise SourceLost(self._why, retry_s=SerialLineSettings.retry_s)
+                raise SourceLost(self._last_error, retry_s=SerialLineSettings.retry_s)
             return None
         if timed.t <= self._last_t:
             return None
         self._last_t = timed.t
         return JointReading(timed.t, frozen_array(self._turns.keep(counts)), timed.sigma)
 
-    def _is_sure(self, timed: Timed) -> bool:
+    def _has_accurate_time(self, timed: Timed) -> bool:
         """Return True if the time of the reading is accurate enough."""
         if timed.sigma > _Settings.largest_sigma_s:
-            self._why = "delayed lines, whose time is unknown"
+            self._last_error = "delayed lines, whose time is unknown"
             return False
         return True
 
@@ -306,7 +306,7 @@ class SerialLineJoints:
             log.info("the encoder of joint %r is well again", joint)
         self._failing = joints
         if joints:
-            self._why = _complaint(min(joints))
+            self._last_error = _complaint(min(joints))
 
 
 def _ticks(count: int | None, otherwise: str) -> str:
@@ -329,11 +329,11 @@ def encoder_checks(config: SerialLinesConfig, joints: Sequence[str], clock: Cloc
             fix = "a higher rate of the UART, fewer other things that the board does"
             yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _Settings.few_per_s)
             lost = counts.garbled + counts.missing
-            said = f"{lost} of {counts.lines + lost} lines were garbled or missing"
+            message = f"{lost} of {counts.lines + lost} lines were garbled or missing"
             fix = "look at the cable, and whether the board keeps the rate exactly"
-            yield warned("errors", said, fix, when=lost > CheckSettings.many_troubles * (counts.lines + lost))
+            yield warned("errors", message, fix, when=lost > CheckSettings.many_troubles * (counts.lines + lost))
             for complaint in encoders.health:
-                said, _, fix = complaint.rpartition(": ")
-                yield Check("encoders", "wrong", said, fix)
+                message, _, fix = complaint.rpartition(": ")
+                yield Check("encoders", "wrong", message, fix)
     except SourceError as error:
         yield Check("encoders", "wrong", str(error))

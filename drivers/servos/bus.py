@@ -26,9 +26,9 @@ class _Settings:
     too_early: float = 0.9
     quiet_s: float = 2e-3
     # longest delay of a late answer: above the 50 ms for which busy USB hosts were seen to hold bytes back
-    owed_s: float = 0.06
+    overdue_s: float = 0.06
     # number of recent requests whose size is avoided
-    asked_lately: int = 4
+    recent_requests: int = 4
     longest_noise_s: float = 0.25  # how long a bus is waited for to fall quiet
     # bytes: from the end of a reading's block to that of the documented registers of the X and P series
     most_spare_bytes: int = 10
@@ -70,7 +70,7 @@ class Answer:
     status: Status
     earliest: float
     latest: float
-    asked: float
+    request_t: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Exchange:
 
     answers: tuple[Answer, ...]
     trouble: Trouble | None = None
-    culprit: int | None = None
+    failed_id: int | None = None
 
 
 @dataclass
@@ -95,7 +95,7 @@ class Counts:
             self.troubles[trouble] = self.troubles.get(trouble, 0) + 1
 
 
-class Owed:
+class OverdueAnswers:
     """Overdue answers. Each may still arrive, and must not be taken for the answer to a later request.
 
     An answer is identified by its servo and its number of bytes. So a servo with an overdue answer is asked for one
@@ -118,23 +118,23 @@ class Owed:
         """Return True and forget the answer if it was overdue."""
         return self._until.pop((protocol, status.id, len(status.data)), None) is not None
 
-    def size_for(self, request: Request, now: float, lately: Collection[int]) -> int | None:
+    def size_for(self, request: Request, now: float, recent_sizes: Collection[int]) -> int | None:
         """Return the smallest number of bytes to request that no overdue answer of the same servos has.
 
-        Prefer one that is not in `lately`. Return None if every size is taken.
+        Prefer one that is not in `recent_sizes`. Return None if every size is taken.
         """
         if self._until:
             self._until = {answer: until for answer, until in self._until.items() if until > now}
         sizes = range(request.size, request.size + request.spare + 1)
-        free = (size for size in sizes if not self._alike(request, size))
+        free = (size for size in sizes if not self._similar_until(request, size))
         first = next(free, None)
-        return next((size for size in chain([first], free) if size not in lately), first)
+        return next((size for size in chain([first], free) if size not in recent_sizes), first)
 
     def until(self, request: Request) -> float:
         """Return the time after which no overdue answer can look like one to `request` [s]."""
-        return max(self._alike(request, request.size))
+        return max(self._similar_until(request, request.size))
 
-    def _alike(self, request: Request, size: int) -> list[float]:
+    def _similar_until(self, request: Request, size: int) -> list[float]:
         answers = ((request.protocol, id, size) for id in request.ids)
         return [self._until[answer] for answer in answers if answer in self._until]
 
@@ -158,9 +158,9 @@ class Bus(ABC):
         self._port, self._clock, self._latency_s = port, clock, latency_s
         self._byte_s = BITS_PER_BYTE / port.baud
         self._sent = self._free_s = 0.0
-        self._owed = Owed()
-        self._asked_size = self._question_size = 0
-        self._asked_lately: dict[tuple[int, ...], deque[int]] = {}
+        self._overdue = OverdueAnswers()
+        self._requested_size = self._request_bytes = 0
+        self._recent_sizes: dict[tuple[int, ...], deque[int]] = {}
 
     @staticmethod
     @abstractmethod
@@ -195,17 +195,19 @@ class Bus(ABC):
     def send(self, request: Request) -> None:
         """Send a request. If overdue answers could pass for its answers, wait first until they can no longer arrive."""
         is_weak = self.is_weak(request)
-        lately = self._asked_lately.setdefault(request.ids, deque(maxlen=_Settings.asked_lately)) if is_weak else ()
-        size = self._owed.size_for(request, self._clock.now(), lately)
+        recent_sizes = (
+            self._recent_sizes.setdefault(request.ids, deque(maxlen=_Settings.recent_requests)) if is_weak else ()
+        )
+        size = self._overdue.size_for(request, self._clock.now(), recent_sizes)
         if size is None and is_weak:
-            until = self._owed.until(request)
+            until = self._overdue.until(request)
             while self._port.receive(until) and self._clock.now() < until:
                 pass
-        self._asked_size = request.size if size is None else size
+        self._requested_size = request.size if size is None else size
         if is_weak:
-            self._asked_lately[request.ids].append(self._asked_size)
-        packet = request.packet(self._asked_size)
-        self._question_size = len(packet)
+            self._recent_sizes[request.ids].append(self._requested_size)
+        packet = request.packet(self._requested_size)
+        self._request_bytes = len(packet)
         self._port.flush()
         self._sent = max(self._clock.now(), self._free_s)
         self._port.write(packet)
@@ -232,7 +234,7 @@ class Bus(ABC):
         received, at = bytearray(), 0
         while data := self._port.receive(until):
             received += data
-            at += self._owed_size(received, at)
+            at += self._overdue_size(received, at)
             if self._clock.now() >= until:  # with endless noise there is always something to receive
                 break
         if at == len(received):
@@ -248,22 +250,22 @@ class Bus(ABC):
         while self._clock.now() < end and self._port.receive(self._clock.now() + quiet_s):
             pass
 
-    def _owed_size(self, received: bytearray, at: int) -> int:
+    def _overdue_size(self, received: bytearray, at: int) -> int:
         """Return how many bytes from `at` on are overdue answers, and forget these."""
         begun, found = at, True
         while found:
             found = False
-            for protocol in self._owed.protocols:
+            for protocol in self._overdue.protocols:
                 with suppress(Garbled):
                     status = self.packets_of(protocol).take(received, at)
-                    if status is not None and self._owed.take(protocol, status):
+                    if status is not None and self._overdue.take(protocol, status):
                         found, at = True, at + status.size
         return at - begun
 
     def _deadline(self, request: Request) -> float:
         """Return the deadline of all answers: their time on the wire, and the delays of adapter and system."""
         overhead = self.packets_of(request.protocol).overhead
-        wire = self._question_size + len(request.ids) * (overhead + self._asked_size)
+        wire = self._request_bytes + len(request.ids) * (overhead + self._requested_size)
         delays = sum(self.return_delay_s.get(id, LARGEST_RETURN_DELAY_S) for id in request.ids)
         return self._sent + wire * self._byte_s + delays + 2 * self._latency_s + HOST_S
 
@@ -271,7 +273,7 @@ class Bus(ABC):
         """Receive the answers of all servos, even if one is missing. Only answers before the missing one count."""
         take, inbox = self.packets_of(request.protocol).take, self._inbox(request)
         answers, missing, waiting = list[Answer](), list[int](), list(request.ids)
-        expected_s, trouble = self._sent + self._question_size * self._byte_s, None
+        expected_s, trouble = self._sent + self._request_bytes * self._byte_s, None
         while waiting and trouble is None:
             status, trouble = self._next(inbox, take)
             if status is None:
@@ -279,18 +281,18 @@ class Bus(ABC):
             if status.id in waiting:
                 while waiting[0] != status.id:
                     missing.append(waiting.pop(0))
-            trouble = self._doubt(request, waiting[0], status, inbox.own + status.size)
+            trouble = self._mismatch(request, waiting[0], status, inbox.own + status.size)
             if trouble is None:
                 expected_s += self.return_delay_s.get(waiting.pop(0), 0.0)
                 if not missing:
                     answers.append(self._timed(request, status, expected_s, inbox, inbox.at))
                 expected_s += status.size * self._byte_s
                 inbox.at += status.size
-        if trouble is None and inbox.at + self._owed_size(inbox.received, inbox.at) < len(inbox.received):
+        if trouble is None and inbox.at + self._overdue_size(inbox.received, inbox.at) < len(inbox.received):
             trouble = Trouble.GARBLED
         if missing and trouble is None:
             trouble = Trouble.TIMEOUT
-        self._note_owed(request, missing + waiting)
+        self._note_overdue(request, missing + waiting)
         culprits = missing + waiting if trouble is Trouble.TIMEOUT else waiting
         return Exchange(tuple(answers), trouble, next(iter(culprits), None))
 
@@ -298,7 +300,7 @@ class Bus(ABC):
         """Return the next answer that is not overdue, or the reason why it is missing."""
         try:
             while True:
-                late = self._owed_size(inbox.received, inbox.at)
+                late = self._overdue_size(inbox.received, inbox.at)
                 inbox.at, inbox.late = inbox.at + late, inbox.late + late
                 taken = take(inbox.received, inbox.at)
                 if taken is not None:
@@ -308,18 +310,18 @@ class Bus(ABC):
         except Garbled:
             return None, Trouble.GARBLED
 
-    def _note_owed(self, request: Request, ids: Iterable[int]) -> None:
+    def _note_overdue(self, request: Request, ids: Iterable[int]) -> None:
         for id in ids:
-            self._owed.add(request.protocol, id, self._asked_size, self._clock.now() + _Settings.owed_s)
+            self._overdue.add(request.protocol, id, self._requested_size, self._clock.now() + _Settings.overdue_s)
 
-    def _doubt(self, request: Request, id: int, status: Status, answered_bytes: int) -> Trouble | None:
+    def _mismatch(self, request: Request, id: int, status: Status, answered_bytes: int) -> Trouble | None:
         if status.id != id:
             return Trouble.FOREIGN
         if status.error & self.packets_of(request.protocol).refusals:
             return Trouble.REFUSED
-        if len(status.data) != self._asked_size:
+        if len(status.data) != self._requested_size:
             return Trouble.WRONG_LENGTH
-        wire_s = (self._question_size + answered_bytes) * self._byte_s
+        wire_s = (self._request_bytes + answered_bytes) * self._byte_s
         if self._clock.now() - self._sent < _Settings.too_early * wire_s:
             return Trouble.EARLY
         return None
@@ -330,8 +332,8 @@ class Bus(ABC):
         The latest start follows from the bytes that came with or after it: all were on the wire before the arrival.
         """
         latest = inbox.arrived - (len(inbox.received) - at) * self._byte_s
-        wanted = Status(status.id, status.error, status.data[: request.size], status.size)
-        return Answer(wanted, min(earliest, latest), latest, self._sent)
+        trimmed = Status(status.id, status.error, status.data[: request.size], status.size)
+        return Answer(trimmed, min(earliest, latest), latest, self._sent)
 
     def _inbox(self, request: Request) -> Inbox:
         return Inbox(self._port, self._clock, self._deadline(request))

@@ -22,8 +22,8 @@ class _Settings:
     surprise_rad: float = math.radians(0.35)
     surprise_ticks: float = 2.0
     # readings that define the usual uncertainty
-    lately: int = 51
-    held_up_s: float = 0.3e-3
+    window: int = 51
+    delay_slack_s: float = 0.3e-3
     # shortest interval between two samples for a speed
     shortest_s: float = 1e-3
     # largest plausible changes, which are slow: 0.1 V, K
@@ -35,7 +35,7 @@ class _Settings:
 class Sample:
     """A servo's decoded answer."""
 
-    question: tuple[str, float]  # the bus, and the time of the request; the same for all answers to one request
+    request_key: tuple[str, float]  # the bus, and the time of the request; the same for all answers to one request
     expected: float  # time of the sample if nothing was delayed [s]
     # earliest, latest: bounds of the time of the sample [s]
     earliest: float
@@ -58,26 +58,26 @@ class Channel(ABC):
     def __init__(self, servo: IdentifiedServo) -> None:
         self.servo = servo
         self.newest: Sample | None = None  # the last accepted sample
-        self.doubts = 0  # number of consecutive rejected answers
-        self.surprising = True  # the newest sample deviates from the trend of the two before it
+        self.rejected_in_a_row = 0  # number of consecutive rejected answers
+        self.is_unexpected = True  # the newest sample deviates from the trend of the two before it
         self._trend: tuple[float, float, float] | None = None
         self._speed = 0.0
-        self._off_course = max(_Settings.surprise_rad / servo.model.rad_per_tick, _Settings.surprise_ticks)
+        self._max_deviation = max(_Settings.surprise_rad / servo.model.rad_per_tick, _Settings.surprise_ticks)
         self._supply: tuple[int, int] | None = None
 
     def take(self, answer: Answer) -> Sample | None:
         """Decode an answer; return None when it cannot be from this servo at this time."""
         sample = self._sample(answer)
         if sample is None:
-            self.doubts += 1
+            self.rejected_in_a_row += 1
             return None
         self._compare(sample)
-        self.newest, self.doubts = sample, 0
+        self.newest, self.rejected_in_a_row = sample, 0
         return sample
 
-    def question(self, answer: Answer) -> tuple[str, float]:
+    def request_key(self, answer: Answer) -> tuple[str, float]:
         """Return the key of the request that was answered."""
-        return self.servo.bus, answer.asked
+        return self.servo.bus, answer.request_t
 
     @abstractmethod
     def _sample(self, answer: Answer) -> Sample | None:
@@ -90,7 +90,7 @@ class Channel(ABC):
         was surprising.
         """
         moved = self._speed * (second.middle - first.middle)
-        return abs(self._step(second.ticks - first.ticks) - moved) <= self._off_course
+        return abs(self._step(second.ticks - first.ticks) - moved) <= self._max_deviation
 
     def _compare(self, sample: Sample) -> None:
         """Update the trend, and note if the sample deviates from it."""
@@ -99,10 +99,10 @@ class Channel(ABC):
             self._trend = (t, sample.ticks, 0.0)
             return
         before_t, before, speed = self._trend
-        if not self.surprising:
+        if not self.is_unexpected:
             self._speed = speed
         moved = self._step(sample.ticks - before)
-        self.surprising = abs(moved - speed * (t - before_t)) > self._off_course
+        self.is_unexpected = abs(moved - speed * (t - before_t)) > self._max_deviation
         self._trend = (t, sample.ticks, moved / max(t - before_t, _Settings.shortest_s))
 
     def _step(self, ticks: float) -> float:
@@ -126,34 +126,34 @@ def middle(samples: Sequence[Sample]) -> tuple[float, float]:
     The servos answer in the pace of the wire, so the answers to one request can only be delayed together: one delay,
     within the bounds of all, shifts them all. Each request has its own delay.
     """
-    total = unsure = 0.0
-    for question in {sample.question for sample in samples}:
-        there = [sample for sample in samples if sample.question == question]
-        least = max(sample.earliest - sample.expected for sample in there)
-        most = min(sample.latest - sample.expected for sample in there)
-        if least <= most:
-            total += sum(sample.expected for sample in there) + len(there) * (least + most) / 2
-            unsure += len(there) * (most - least) / 2
+    total = uncertainty_s = 0.0
+    for request_key in {sample.request_key for sample in samples}:
+        group = [sample for sample in samples if sample.request_key == request_key]
+        min_delay = max(sample.earliest - sample.expected for sample in group)
+        max_delay = min(sample.latest - sample.expected for sample in group)
+        if min_delay <= max_delay:
+            total += sum(sample.expected for sample in group) + len(group) * (min_delay + max_delay) / 2
+            uncertainty_s += len(group) * (max_delay - min_delay) / 2
         else:
-            total += sum(sample.earliest + sample.latest for sample in there) / 2
-            unsure += sum(sample.latest - sample.earliest for sample in there) / 2
-    return total / len(samples), unsure / len(samples)
+            total += sum(sample.earliest + sample.latest for sample in group) / 2
+            uncertainty_s += sum(sample.latest - sample.earliest for sample in group) / 2
+    return total / len(samples), uncertainty_s / len(samples)
 
 
 class Punctuality:
     """Detector of readings that were delayed so much that their time is less certain than usual."""
 
     def __init__(self) -> None:
-        self._unsure: deque[float] = deque(maxlen=_Settings.lately)
+        self._uncertainties: deque[float] = deque(maxlen=_Settings.window)
 
-    def is_usual(self, unsure: float) -> bool:
+    def is_usual(self, uncertainty_s: float) -> bool:
         """Return True if a reading's time is about as certain as usual, and include it in the median."""
-        self._unsure.append(unsure)
-        usual = median(self._unsure)
-        return unsure <= max(usual + _Settings.held_up_s, 2 * usual)
+        self._uncertainties.append(uncertainty_s)
+        usual = median(self._uncertainties)
+        return uncertainty_s <= max(usual + _Settings.delay_slack_s, 2 * usual)
 
 
-class Drive(Protocol):
+class TorqueController(Protocol):
     """A component that moves or releases joints of an arm. Called by the reading thread, except `complaints`.
 
     Torque is off when it is opened. A servo fault never raises an exception: the joints are released.

@@ -15,7 +15,7 @@ from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Request
 from .config import ServosConfig
-from .handshake import Finding, ask_again, identify
+from .handshake import Finding, ask_with_retries, identify
 from .joints import OpenPort, open_serial
 from .servo import IdentifiedServo
 from .vendor import ServoVendor, plans_of
@@ -74,24 +74,24 @@ def _presence(found: Sequence[Finding]) -> Iterator[Check]:
     missing = [finding for finding in found if finding.servo is None]
     for finding in missing:
         config = finding.config
-        said = f"joint {config.joint} (ID {config.id}, {config.model}): {finding.found}"
-        yield Check(TYPE, "wrong", said, "bodyschema scan --robot robot.toml    # who is there instead")
+        message = f"joint {config.joint} (ID {config.id}, {config.model}): {finding.found}"
+        yield Check(TYPE, "wrong", message, "bodyschema scan --robot robot.toml    # who is there instead")
     if not missing:
         yield Check(TYPE, "ok", f"all {len(found)} answer, each of the model that robot.toml names")
 
 
 def _health(vendor: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[Check]:
     layout = servo.model.layout
-    exchange = ask_again(bus, bus.read_request(servo.model, servo.id, layout.state))
+    exchange = ask_with_retries(bus, bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
-        said = f"joint {servo.joint} (ID {servo.id}) does not report its state: {exchange.trouble}"
-        yield Check(TYPE, "wrong", said, "look at cable and connectors, then bodyschema doctor once more")
+        message = f"joint {servo.joint} (ID {servo.id}) does not report its state: {exchange.trouble}"
+        yield Check(TYPE, "wrong", message, "look at cable and connectors, then bodyschema doctor once more")
         return
     has_torque, bits = layout.torque_and_errors(exchange.answers[0].status)
     for bit, text in vendor.errors.items():
         if bits & bit:
-            said, _, fix = text.partition(": ")
-            yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {said}", fix)
+            message, _, fix = text.partition(": ")
+            yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {message}", fix)
     if has_torque:
         yield Check(TYPE, "ok", f"joint {servo.joint} holds its place: `bodyschema run` switches its torque off")
 
@@ -102,8 +102,8 @@ def _delays(servos: Sequence[IdentifiedServo]) -> Iterator[Check]:
         if slow:
             worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
             names = ", ".join(servo.joint for servo in slow)
-            said = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
-            yield Check(TYPE, "warning", said, f"bodyschema servos return_delay=0 --bus {name}")
+            message = f"{names}: each answer comes {worst_us:.0f} µs late by Return Delay Time"
+            yield Check(TYPE, "warning", message, f"bodyschema servos return_delay=0 --bus {name}")
 
 
 def _pace(
@@ -134,10 +134,10 @@ def _pace(
 def _read_all(buses: dict[str, Bus], requests: dict[str, list[Request]]) -> bool:
     is_whole = True
     for questions in zip_longest(*requests.values()):
-        asked = [(bus, question) for bus, question in zip(buses.values(), questions, strict=True) if question]
-        for bus, question in asked:
+        requested = [(bus, question) for bus, question in zip(buses.values(), questions, strict=True) if question]
+        for bus, question in requested:
             bus.send(question)
-        for bus, question in asked:
+        for bus, question in requested:
             is_whole &= bus.collect(question).trouble is None
     return is_whole
 
@@ -148,16 +148,16 @@ def _rate(times: Sequence[float], read_s: float, config: ServosConfig[Any]) -> C
         return Check("rate", "wrong", "no reading of all servos came through", "look at cable, supply and baud rates")
     intervals = [b - a for a, b in pairwise(times)]
     jitter_ms = 1e3 * (quantiles(intervals, n=20)[-1] - median(intervals))
-    said = f"{rate:.0f} readings/s are possible ({wanted_hz:.0f} wanted), jitter {jitter_ms:.1f} ms (95 %)"
+    message = f"{rate:.0f} readings/s are possible ({wanted_hz:.0f} wanted), jitter {jitter_ms:.1f} ms (95 %)"
     slow = next((name for name, bus in config.buses.items() if bus.baud < _Settings.fast_baud), None)
     faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
     fix = faster if slow is None else f"bodyschema servos baud={_Settings.fast_baud} --bus {slow}"
-    return warned("rate", said, fix, when=rate < min(_Settings.few_per_s, wanted_hz))
+    return warned("rate", message, fix, when=rate < min(_Settings.few_per_s, wanted_hz))
 
 
 def _troubles(name: str, exchanges: int, troubles: dict[str, int]) -> Check:
     count = sum(troubles.values())
     words = ", ".join(f"{n}× {what}" for what, n in sorted(troubles.items(), key=lambda item: -item[1]))
-    said = f"{count} of {exchanges} questions on {name} went wrong{f': {words}' if words else ''}"
+    message = f"{count} of {exchanges} questions on {name} went wrong{f': {words}' if words else ''}"
     fix = "look at cable and connectors, the supply's voltage under load, noise"
-    return warned("errors", said, fix, when=count > CheckSettings.many_troubles * exchanges)
+    return warned("errors", message, fix, when=count > CheckSettings.many_troubles * exchanges)

@@ -99,6 +99,6 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
     def _other_model(self, name: str) -> str:
         for known in self.unsupported:
             if name.replace("-", "").upper() == known.replace("-", "").upper():
-                said = no_driver(known)
-                return said[0].upper() + said[1:]
+                message = no_driver(known)
+                return message[0].upper() + message[1:]
         return did_you_mean(name, self.models)

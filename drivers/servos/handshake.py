@@ -25,7 +25,7 @@ class HandshakeSettings:
 
 
 # What a busy machine or a loose cable does too; not a wrong ID, rate or setting.
-PASSING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY)
+TRANSIENT = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY)
 GARBLED = "garbled answers: two servos with this ID, or a bad cable"
 SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs, and says what to do"
 
@@ -46,7 +46,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     head = Register(0, max(layout["model"].end, layout["firmware"].end))
     data, trouble = read_register(bus, model, config.id, head)
     if data is None:
-        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=trouble in PASSING)
+        return Finding(config, _absence_reason(bus, model, config.id, trouble), may_come_back=trouble in TRANSIENT)
     number = layout.value("model", data)
     if number != model.number:
         other = known.get(number)
@@ -54,7 +54,7 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
     last = max(layout[name].end for name in SETTINGS if name in layout)
     table, trouble = read_register(bus, model, config.id, Register(0, last))
     if table is None:
-        return Finding(config, _absence(bus, model, config.id, trouble), may_come_back=True)
+        return Finding(config, _absence_reason(bus, model, config.id, trouble), may_come_back=True)
     if _is_garbled(bus, model, config.id):
         return Finding(config, GARBLED, may_come_back=True)
     servo = IdentifiedServo(
@@ -150,11 +150,11 @@ def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[
 
 
 def _read_once(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
-    exchange = ask_again(bus, bus.read_request(model, id, register))
+    exchange = ask_with_retries(bus, bus.read_request(model, id, register))
     return (exchange.answers[0].status.data if exchange.trouble is None else None), exchange.trouble
 
 
-def ask_again(bus: Bus, request: Request) -> Exchange:
+def ask_with_retries(bus: Bus, request: Request) -> Exchange:
     """Repeat a request until it is answered, a few times at most."""
     exchange = Exchange(())
     for _ in range(HandshakeSettings.attempts):
@@ -164,7 +164,7 @@ def ask_again(bus: Bus, request: Request) -> Exchange:
     return exchange
 
 
-def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
+def _absence_reason(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
     if trouble is Trouble.TIMEOUT:
         if bus.ping(model, id).trouble is None:
             return bus.packets_of(model.protocol).pinged_only

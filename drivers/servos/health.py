@@ -11,7 +11,7 @@ from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.servos import ServoStatus
 
-from .channel import Drive, Sample
+from .channel import Sample, TorqueController
 from .model import Register
 from .servo import IdentifiedServo
 
@@ -94,15 +94,15 @@ class Inspection:
         buses: Mapping[str, Bus],
         servos: Sequence[IdentifiedServo],
         health: Health,
-        drives: Sequence[Drive],
+        drives: Sequence[TorqueController],
         clock: Clock,
     ) -> None:
         """Inspect `servos` on the open `buses`; update `health`. The `drives` may hold some of them."""
         self._buses, self._servos, self._health, self._drives = buses, servos, health, drives
         self._clock, self._next_s = clock, clock.now()
-        self._looked = 0
+        self._inspected = 0
 
-    def go_on(self) -> None:
+    def inspect_next(self) -> None:
         """Inspect the next servo if it is due.
 
         Raises:
@@ -110,15 +110,15 @@ class Inspection:
         """
         if self._clock.now() < self._next_s:
             return
-        servo = self._servos[self._looked % len(self._servos)]
+        servo = self._servos[self._inspected % len(self._servos)]
         exchange = self._ask_state(servo)
         if exchange.trouble is not None or not self._is_confirmed(servo, exchange):
             return
-        self._looked += 1
-        if self._looked >= len(self._servos):  # the first round is made at once
+        self._inspected += 1
+        if self._inspected >= len(self._servos):  # the first round is made at once
             self._next_s = self._clock.now() + _Settings.every_s
-        self._judge(servo, exchange)
-        if self._looked % _Settings.supply_every == 0 or servo.joint not in self._health.supplies:
+        self._check_state(servo, exchange)
+        if self._inspected % _Settings.supply_every == 0 or servo.joint not in self._health.supplies:
             self._ask_supply(servo)
 
     def first_silent(self) -> str | None:
@@ -132,13 +132,13 @@ class Inspection:
 
     def _is_confirmed(self, servo: IdentifiedServo, exchange: Exchange) -> bool:
         """Confirm an alert or torque by asking again if the checksum lets one in 256 wrong answers through."""
-        told = _state_in(servo, exchange)
-        if not any(told) or not self._buses[servo.bus].is_weak(self._state_request(servo)):
+        state = _state_in(servo, exchange)
+        if not any(state) or not self._buses[servo.bus].is_weak(self._state_request(servo)):
             return True
         again = self._ask_state(servo)
-        return again.trouble is None and _state_in(servo, again) == told
+        return again.trouble is None and _state_in(servo, again) == state
 
-    def _judge(self, servo: IdentifiedServo, exchange: Exchange) -> None:
+    def _check_state(self, servo: IdentifiedServo, exchange: Exchange) -> None:
         has_torque, bits = _state_in(servo, exchange)
         if has_torque and not any(servo.joint in drive.holding for drive in self._drives):
             raise SourceLost(f"the torque of joint {servo.joint!r} was switched on by another program", retry_s=0.0)

@@ -22,12 +22,12 @@ from bodyschema.interfaces.records import JointReading, frozen_array
 from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .bus import Bus, Counts, Request
-from .channel import Channel, Drive, Punctuality, Sample, middle
+from .channel import Channel, Punctuality, Sample, TorqueController, middle
 from .config import ServoBusConfig, ServosConfig
 from .handshake import HandshakeSettings, identify, require_all, restore_torque, switch_torque_off
 from .health import Health, Inspection
 from .servo import IdentifiedServo
-from .vendor import Plan, ServoVendor, plans_of
+from .vendor import ReadPlan, ServoVendor, plans_of
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class _Settings:
     # this many must fail as well: the program itself may have been delayed
     few_polls: int = 3
     # consecutive implausible answers after which the servo was restarted
-    doubts: int = 5
+    rejected_in_a_row: int = 5
     anchor_polls: int = 50
     slack_ticks: int = 3
     improve_every_s: float = 10.0  # a failed attempt costs a reading or two
@@ -81,21 +81,21 @@ class ServoJoints:
         # of each joint [rad]; a range below one turn determines the turn
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
-        drives: Sequence[Drive] = (),  # may move joints on request; without any, torque stays off
+        drives: Sequence[TorqueController] = (),  # may move joints on request; without any, torque stays off
     ) -> None:
         self._config, self.joints, self._clock = config, tuple(joints), clock
         self._open_port, self.drives = open_port, tuple(drives)
         by_joint = {servo.joint: servo for servo in config.servos}
-        self._wanted = [by_joint[joint] for joint in joints]
+        self._configured = [by_joint[joint] for joint in joints]
         unlimited = [(-math.inf, math.inf)] * len(joints)
         self._turns = TurnCount(limits or unlimited, last_pose)
         self._buses: dict[str, Bus] = {}
-        self._plans: dict[str, Plan] = {}
+        self._plans: dict[str, ReadPlan] = {}
         self._opened = ExitStack()
         self._is_open = self._is_lost = False
         self._had_torque: set[str] = set()
         self._channels: list[Channel] = []
-        self._at: dict[tuple[str, int], int] = {}
+        self._place_of: dict[tuple[str, int], int] = {}
         self._last_t = -math.inf
         self._health = Health(self.vendor.errors)
         self._counts = {name: Counts() for name in config.buses}
@@ -121,8 +121,8 @@ class ServoJoints:
         for name, counts in self._counts.items():
             troubles = {str(trouble): count for trouble, count in list(counts.troubles.items())}
             answered = 1.0 - sum(troubles.values()) / counts.exchanges if counts.exchanges else 0.0
-            way = self._plans[name].name if name in self._plans else ""
-            found[name] = BusStatus(counts.exchanges, round(answered, 5), troubles, way)
+            read_method = self._plans[name].name if name in self._plans else ""
+            found[name] = BusStatus(counts.exchanges, round(answered, 5), troubles, read_method)
         return found
 
     @property
@@ -150,7 +150,7 @@ class ServoJoints:
             config = self._config
             findings = [
                 identify(self._buses[config.bus_of(servo)], servo, config.model_of(servo), self.vendor.models)
-                for servo in self._wanted
+                for servo in self._configured
             ]
             self._health.absent = {each.config.joint: each.found for each in findings if each.servo is None}
             servos = require_all(findings, ", ".join(bus.port for bus in config.buses.values()))
@@ -165,7 +165,7 @@ class ServoJoints:
         self._is_open, self._is_lost = True, False
         self._had_torque.update(servo.joint for servo in self.servos if servo.had_torque)
         self.epoch += 1
-        self._say_opened()
+        self._log_opened()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -222,45 +222,45 @@ class ServoJoints:
             self._health.away.add(name)
             port, latency_s = self._open_port(config, self._clock)
             stack.callback(close_quietly, port)
-            heard = without_echo(port, self._clock, latency_s)
-            self._buses[name] = self.vendor.bus(name, heard, self._clock, latency_s)
+            echo_free = without_echo(port, self._clock, latency_s)
+            self._buses[name] = self.vendor.bus(name, echo_free, self._clock, latency_s)
             self._buses[name].counts = self._counts[name]
             self._health.away.discard(name)
 
     def _prepare(self) -> None:
         self._plans = plans_of(self.vendor, self._buses, self.servos, self._config)
         self._channels = [self.vendor.channel(servo) for servo in self.servos]
-        self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
+        self._place_of = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         self._gate = SpeedGate(
             [FASTEST_RAD_S / s.model.rad_per_tick for s in self.servos], [_Settings.slack_ticks] * len(self.servos)
         )
         self._punctuality = Punctuality()
         now = self._clock.now()
-        self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
+        self._accepted_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
         self._improve_s = now + _Settings.improve_every_s
         self._inspection = Inspection(self._buses, self.servos, self._health, self.drives, self._clock)
-        self._why = "no answer"
+        self._last_error = "no answer"
 
     def _anchor(self) -> None:
         """Find the turn of each joint from two consistent readings."""
-        believed = 0
+        agreeing = 0
         for _ in range(_Settings.anchor_polls):
             samples = self._ask_all()
             if samples is None:
                 continue
             raw = [sample.ticks for sample in samples]
-            if believed == 0:
+            if agreeing == 0:
                 self._turns.begin(self.servos, raw)
-            counts = self._turns.continued(raw)
-            believed = believed + 1 if self._gate.offer(middle(samples)[0], counts) is None else 0
-            if believed == 2:
+            counts = self._turns.unwrapped(raw)
+            agreeing = agreeing + 1 if self._gate.offer(middle(samples)[0], counts) is None else 0
+            if agreeing == 2:
                 self._turns.counts = counts
                 self._turns.check(raw)
-                self._believed_s, self._failures = self._clock.now(), 0
+                self._accepted_s, self._failures = self._clock.now(), 0
                 return
-        raise SourceLost(f"the servos cannot be read: {self._why}", retry_s=HandshakeSettings.retry_s)
+        raise SourceLost(f"the servos cannot be read: {self._last_error}", retry_s=HandshakeSettings.retry_s)
 
-    def _say_opened(self) -> None:
+    def _log_opened(self) -> None:
         switched = [servo.joint for servo in self.servos if servo.had_torque]
         how = "; ".join(f"{name}: {plan.name}" for name, plan in self._plans.items())
         log.info("%d servos, torque verified off, are read (%s)", len(self.servos), how)
@@ -286,8 +286,8 @@ class ServoJoints:
 
     def _poll(self) -> JointReading | None:
         samples = self._ask_all()
-        reading = None if samples is None else self._judge(samples)
-        self._inspection.go_on()
+        reading = None if samples is None else self._accepted(samples)
+        self._inspection.inspect_next()
         self._improve()
         for why in [drive.step(reading, self.samples) for drive in self.drives]:
             if why is not None:
@@ -295,10 +295,10 @@ class ServoJoints:
         if reading is None:
             self.dropped += 1
             self._failures += 1
-            if self._failures >= _Settings.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
-                raise SourceLost(self._inspection.first_silent() or self._why, retry_s=HandshakeSettings.retry_s)
+            if self._failures >= _Settings.few_polls and self._clock.now() - self._accepted_s > LOST_AFTER_S:
+                raise SourceLost(self._inspection.first_silent() or self._last_error, retry_s=HandshakeSettings.retry_s)
         else:
-            self._believed_s, self._failures = self._clock.now(), 0
+            self._accepted_s, self._failures = self._clock.now(), 0
         return reading
 
     def _improve(self) -> None:
@@ -317,66 +317,68 @@ class ServoJoints:
     def _ask_all(self) -> list[Sample] | None:
         """Ask all buses at the same time and return a sample of each joint; None if one is missing or doubtful."""
         samples: dict[int, Sample] = {}
-        for questions in zip_longest(*(plan.requests for plan in self._plans.values())):
-            asked = [(bus, q) for bus, q in zip(self._buses.values(), questions, strict=True) if q is not None]
-            for bus, question in asked:
-                bus.send(question)
-            for bus, question in asked:
-                self._take(bus, question, samples)
+        for requests in zip_longest(*(plan.requests for plan in self._plans.values())):
+            requested = [(bus, q) for bus, q in zip(self._buses.values(), requests, strict=True) if q is not None]
+            for bus, request in requested:
+                bus.send(request)
+            for bus, request in requested:
+                self._collect_samples(bus, request, samples)
         return [samples[place] for place in range(len(self.joints))] if len(samples) == len(self.joints) else None
 
-    def _take(self, bus: Bus, question: Request, samples: dict[int, Sample]) -> None:
-        exchange = bus.collect(question)
+    def _collect_samples(self, bus: Bus, request: Request, samples: dict[int, Sample]) -> None:
+        exchange = bus.collect(request)
         stale = False
         for answer in exchange.answers:
-            place = self._at[bus.name, answer.status.id]
+            place = self._place_of[bus.name, answer.status.id]
             channel = self._channels[place]
             sample = channel.take(answer)
             if sample is None:
                 stale = True
-                self._why = f"joint {self.joints[place]!r}: an answer from another time"
-                if channel.doubts >= _Settings.doubts:
+                self._last_error = f"joint {self.joints[place]!r}: an answer from another time"
+                if channel.rejected_in_a_row >= _Settings.rejected_in_a_row:
                     raise SourceLost(
                         f"joint {channel.servo.joint!r} (ID {channel.servo.id}) was restarted",
                         retry_s=HandshakeSettings.retry_s,
                     )
-            elif exchange.trouble is None and self._is_confirmed(bus, question, channel, sample):
+            elif exchange.trouble is None and self._is_confirmed(bus, request, channel, sample):
                 samples[place] = sample
-        if exchange.trouble is not None and exchange.culprit is not None:
-            servo = self.servos[self._at[bus.name, exchange.culprit]]
-            self._why = f"joint {servo.joint!r} (ID {servo.id}): {exchange.trouble}"
+        if exchange.trouble is not None and exchange.failed_id is not None:
+            servo = self.servos[self._place_of[bus.name, exchange.failed_id]]
+            self._last_error = f"joint {servo.joint!r} (ID {servo.id}): {exchange.trouble}"
         elif exchange.trouble is not None:
-            self._why = f"{bus.name}: {exchange.trouble}"
+            self._last_error = f"{bus.name}: {exchange.trouble}"
         elif stale:
             bus.settle()
 
-    def _is_confirmed(self, bus: Bus, question: Request, channel: Channel, sample: Sample) -> bool:
+    def _is_confirmed(self, bus: Bus, request: Request, channel: Channel, sample: Sample) -> bool:
         """Confirm a surprising position by asking again if the checksum lets one in 256 wrong answers through."""
-        if not bus.is_weak(question) or not channel.surprising:
+        if not bus.is_weak(request) or not channel.is_unexpected:
             return True
         model = channel.servo.model
         exchange = bus.ask(bus.read_request(model, channel.servo.id, model.layout.block))
         again = channel.take(exchange.answers[0]) if exchange.trouble is None else None
         return again is not None and channel.agrees(sample, again)
 
-    def _judge(self, samples: list[Sample]) -> JointReading | None:
-        t, unsure = middle(samples)
-        if not self._punctuality.is_usual(unsure):
-            self._why = "an answer that was held up"
-            self._believed_s = self._clock.now()  # no servo is missing
+    def _accepted(self, samples: list[Sample]) -> JointReading | None:
+        t, uncertainty_s = middle(samples)
+        if not self._punctuality.is_usual(uncertainty_s):
+            self._last_error = "an answer that was held up"
+            self._accepted_s = self._clock.now()  # no servo is missing
             return None
-        counts = self._turns.continued([sample.ticks for sample in samples])
-        refused = self._gate.offer(t, counts)
-        if refused is not None:
-            servo = self.servos[refused]
-            self._why = f"joint {servo.joint!r} (ID {servo.id}): a position where it cannot have come to"
+        counts = self._turns.unwrapped([sample.ticks for sample in samples])
+        rejected = self._gate.offer(t, counts)
+        if rejected is not None:
+            servo = self.servos[rejected]
+            self._last_error = f"joint {servo.joint!r} (ID {servo.id}): a position where it cannot have come to"
             if self._gate.jumped:
-                raise SourceLost(self._why, retry_s=HandshakeSettings.retry_s)
+                raise SourceLost(self._last_error, retry_s=HandshakeSettings.retry_s)
             return None
         if t <= self._last_t:
             return None
         self._last_t = t
-        return JointReading(t, frozen_array(self._turns.keep(counts)), unsure / math.sqrt(3))  # of a uniform error
+        return JointReading(
+            t, frozen_array(self._turns.keep(counts)), uncertainty_s / math.sqrt(3)
+        )  # of a uniform error
 
     def _wait_until(self, t: float) -> bool:
         """Wait until a time. Return False when a servo sent bytes that were not requested."""

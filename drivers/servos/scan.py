@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from bodyschema.drivers.echo import BITS_PER_BYTE, HOST_S, Port, without_echo
 from bodyschema.drivers.serial_line import SerialLine, SerialLineSettings
-from bodyschema.drivers.servos.handshake import ask_again
+from bodyschema.drivers.servos.handshake import ask_with_retries
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.servos import FoundServo, ScannedBus
@@ -39,7 +39,7 @@ class ServoProtocol:
     def packets(self) -> Packets:
         return self.bus.packets_of(self.version)
 
-    def told(self, head: bytes, id: int) -> Identity | None:
+    def identified(self, head: bytes, id: int) -> Identity | None:
         """Identify the servo by the start of its control table; return None if it is not of this protocol."""
         layouts = {model.layout.protocol: model.layout for model in self.models.values()}
         of_id = [layout for layout in layouts.values() if layout.value("id", head) == id]
@@ -99,17 +99,17 @@ class PingScanner:
         for id in IDS:
             begin = clock.now()
             port.write(self._packets.ping(id))
-            received += heard(port, clock, begin + spacing)
-        received += heard(port, clock, clock.now() + 2 * latency_s + HOST_S)
+            received += receive_until(port, clock, begin + spacing)
+        received += receive_until(port, clock, clock.now() + 2 * latency_s + HOST_S)
         statuses, is_clean = self._statuses(received)
         ids = {status.id for status in statuses}
-        return sorted(ids if is_clean else ids | self._unclear(port, clock, latency_s, ids))
+        return sorted(ids if is_clean else ids | self._ids_asked_singly(port, clock, latency_s, ids))
 
     def _spacing_s(self, baud: int, shortest_s: float = 1e-3) -> float:
         """Return the time between two requests [s], so that the answer to the first has ended."""
         return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + LARGEST_RETURN_DELAY_S, shortest_s)
 
-    def _unclear(self, port: Port, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
+    def _ids_asked_singly(self, port: Port, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
         """Return the IDs that answer anything, asked one by one."""
         wait_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + LARGEST_RETURN_DELAY_S + 2 * latency_s + HOST_S
         found = set[int]()
@@ -118,7 +118,7 @@ class PingScanner:
                 continue
             port.flush()
             port.write(self._packets.ping(id))
-            if heard(port, clock, clock.now() + wait_s, self._ping_sizes[1]):
+            if receive_until(port, clock, clock.now() + wait_s, self._ping_sizes[1]):
                 found.add(id)
         return found
 
@@ -142,22 +142,24 @@ class PingScanner:
         """Return the servo with its identity and state."""
         protocol = self._protocols[0]
         servo, bus = FoundServo(name, port.baud, self.protocol, id), protocol.bus(name, port, clock, latency_s)
-        head = _asked(bus, protocol, id, self._head)
+        head = _read_with_retries(bus, protocol, id, self._head)
         if head.trouble is Trouble.TIMEOUT:
-            said = {protocol.packets.pinged_only: protocol.name for protocol in self._protocols}
-            alone = len(said) == 1
+            hints = {protocol.packets.pinged_only: protocol.name for protocol in self._protocols}
+            alone = len(hints) == 1
             return replace(
-                servo, troubles=tuple(text if alone else f"if {name}: {text}" for text, name in said.items())
+                servo, troubles=tuple(text if alone else f"if {name}: {text}" for text, name in hints.items())
             )
         if head.trouble is not None:
             return replace(servo, is_double=True, troubles=(DOUBLE,))
-        told = [
+        identified = [
             found
             for protocol in self._protocols
-            if (found := protocol.told(head.answers[0].status.data, id)) is not None
+            if (found := protocol.identified(head.answers[0].status.data, id)) is not None
         ]
         # The first protocol with this model, else the first possible one.
-        identity = next((found for found in told if found.model is not None), told[0] if told else None)
+        identity = next(
+            (found for found in identified if found.model is not None), identified[0] if identified else None
+        )
         unsupported = protocol.unsupported.get(int.from_bytes(head.answers[0].status.data[:2], "little"))
         if unsupported is not None:
             return replace(servo, model=unsupported, troubles=(no_driver(unsupported),))
@@ -180,10 +182,12 @@ class PingScanner:
 def _with_state(bus: Bus, servo: FoundServo, protocol: ServoProtocol, model: Model) -> FoundServo:
     layout = model.layout
     first, last = layout["torque"].address, layout["temperature"].end
-    told = _asked(bus, protocol, servo.id, Register(first, last - first))
-    if told.trouble is not None:  # two servos of one model give the same answers until registers that differ are read
+    exchange = _read_with_retries(bus, protocol, servo.id, Register(first, last - first))
+    if (
+        exchange.trouble is not None
+    ):  # two servos of one model give the same answers until registers that differ are read
         return replace(servo, is_double=True, troubles=(DOUBLE,))
-    status = told.answers[0].status
+    status = exchange.answers[0].status
     has_torque, bits = layout.torque_and_errors(status)
     troubles = [text for bit, text in protocol.errors.items() if bits & bit]
     if servo.baud not in protocol.bauds:
@@ -197,16 +201,16 @@ def _with_state(bus: Bus, servo: FoundServo, protocol: ServoProtocol, model: Mod
     )
 
 
-def _asked(bus: Bus, protocol: ServoProtocol, id: int, register: Register) -> Exchange:
+def _read_with_retries(bus: Bus, protocol: ServoProtocol, id: int, register: Register) -> Exchange:
     request = Request(lambda n: protocol.packets.read(id, register.address, n), (id,), register.size, protocol.version)
-    return ask_again(bus, request)
+    return ask_with_retries(bus, request)
 
 
 DOUBLE = "two servos have this ID, or the cable is bad: take one off, give the other another ID"
 UNKNOWN = "a model that no driver knows"
 
 
-def heard(port: Port, clock: Clock, end: float, enough: int | None = None) -> bytes:
+def receive_until(port: Port, clock: Clock, end: float, enough: int | None = None) -> bytes:
     """Return what arrives until `end`; with `enough` stop after this many bytes."""
     received = b""
     while clock.now() < end and (enough is None or len(received) < enough):

@@ -35,22 +35,22 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A number to be written: `then` in place of `now`."""
+    """A number to be written: `target` in place of `now`."""
 
     servo: IdentifiedServo
     setting: Setting
     now: int
-    then: int
+    target: int
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class WriteResult:
     """Outcome of a change."""
 
     change: Change
     outcome: Outcome
     found: int | None = None  # value read back; None if no servo answered
-    said: str = ""  # explanation; empty if the value was written and read back
+    remarks: str = ""  # explanation; empty if the value was written and read back
 
 
 class EepromEditor:
@@ -78,11 +78,11 @@ class EepromEditor:
             del self._buses[port]
             bus.close()
         opened, latency_s = self._open_at(port, baud)
-        heard = without_echo(opened, self._clock, latency_s)
-        self._buses[port] = (baud, self.vendor.bus(port, heard, self._clock, latency_s))
+        echo_free = without_echo(opened, self._clock, latency_s)
+        self._buses[port] = (baud, self.vendor.bus(port, echo_free, self._clock, latency_s))
         return self._buses[port][1]
 
-    def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
+    def identified_servo(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
         """Return the servo found on the bus; raise SourceError if it is a different one or does not answer."""
         finding = identify(bus, config, model, self.vendor.models)
         if finding.servo is None:
@@ -94,9 +94,9 @@ class EepromEditor:
 
     def model_at(self, bus: Bus, id: int) -> Model | None:
         """Identify the model of the servo with an ID by trying all protocols of the vendor. Return None if unknown."""
-        for protocol, any_of_it in self._by_protocol.items():
-            register = any_of_it.layout["model"]
-            data, _ = read_register(bus, any_of_it, id, register)
+        for protocol, example in self._by_protocol.items():
+            register = example.layout["model"]
+            data, _ = read_register(bus, example, id, register)
             model = None if data is None else self.vendor.models.get(register.value(data))
             if model is not None and model.protocol == protocol:
                 return model
@@ -130,53 +130,57 @@ class EepromEditor:
         for servo in servos:
             switch_torque_off(bus, servo)
 
-    def write(self, bus: Bus, change: Change) -> Done:
+    def write(self, bus: Bus, change: Change) -> WriteResult:
         """Write a change and read it back. Torque must be off. For baud rates use `write_bauds`."""
         self._unlock(bus, change.servo)
-        done = self._tried(bus, change)
+        done = self._write_once(bus, change)
         for _ in range(HandshakeSettings.attempts - 1):
             if done.outcome is Outcome.KEPT:
-                done = self._tried(bus, change)
-        return self._locked(bus, done)
+                done = self._write_once(bus, change)
+        return self._relock(bus, done)
 
-    def write_bauds(self, port: str, baud: int, then: int, changes: Sequence[Change]) -> list[Done]:
+    def write_bauds(self, port: str, baud: int, target: int, changes: Sequence[Change]) -> list[WriteResult]:
         """Change the baud rate [bit/s] of servos of one port; verify each at the new rate, otherwise at its old one."""
         bus = self.bus(port, baud)
         for change in changes:
             self._unlock(bus, change.servo)
-            self._tell(bus, change.servo, change.setting.register, change.then)
-        return [self._met(port, baud, then, change) for change in changes]
+            self._write_unanswered(bus, change.servo, change.setting.register, change.target)
+        return [self._baud_result(port, baud, target, change) for change in changes]
 
-    def _tried(self, bus: Bus, change: Change) -> Done:
+    def _write_once(self, bus: Bus, change: Change) -> WriteResult:
         servo, register = change.servo, change.setting.register
-        self._tell(bus, servo, register, change.then)
-        id = change.then if change.setting.name == ID else servo.id
+        self._write_unanswered(bus, servo, register, change.target)
+        id = change.target if change.setting.name == ID else servo.id
         data, trouble = read_register(bus, servo.model, id, register)
         if data is None and change.setting.name == ID:
             old, _ = read_register(bus, servo.model, servo.id, register)
             if old is not None:
-                return Done(change, Outcome.KEPT, servo.id, "the servo refuses it, and answers to its old ID")
+                return WriteResult(change, Outcome.KEPT, servo.id, "the servo refuses it, and answers to its old ID")
         if data is None:
-            return _lost(change, trouble)
+            return _unknown_result(change, trouble)
         found = register.value(data)
-        if found == change.then:
-            return Done(change, Outcome.WRITTEN, found)
+        if found == change.target:
+            return WriteResult(change, Outcome.WRITTEN, found)
         if found == change.now:
-            return Done(change, Outcome.KEPT, found, "the servo refuses it: out of range for this model, or locked")
-        return Done(change, Outcome.OTHER, found, f"{change.setting.shown(found)} was read back")
+            return WriteResult(
+                change, Outcome.KEPT, found, "the servo refuses it: out of range for this model, or locked"
+            )
+        return WriteResult(change, Outcome.OTHER, found, f"{change.setting.shown(found)} was read back")
 
-    def _met(self, port: str, baud: int, then: int, change: Change) -> Done:
+    def _baud_result(self, port: str, baud: int, target: int, change: Change) -> WriteResult:
         servo, register = change.servo, change.setting.register
-        data, trouble = read_register(self.bus(port, then), servo.model, servo.id, register)
+        data, trouble = read_register(self.bus(port, target), servo.model, servo.id, register)
         if data is not None:
-            return self._locked(self.bus(port, then), Done(change, Outcome.WRITTEN, register.value(data)))
+            return self._relock(self.bus(port, target), WriteResult(change, Outcome.WRITTEN, register.value(data)))
         data, _ = read_register(self.bus(port, baud), servo.model, servo.id, register)
         if data is not None:
-            said = f"it still answers at {baud:,} bit/s"
-            return self._locked(self.bus(port, baud), Done(change, Outcome.KEPT, register.value(data), said))
-        return _lost(change, trouble)
+            remarks = f"it still answers at {baud:,} bit/s"
+            return self._relock(self.bus(port, baud), WriteResult(change, Outcome.KEPT, register.value(data), remarks))
+        return _unknown_result(change, trouble)
 
-    def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int, deaf_s: float = 0.02) -> None:
+    def _write_unanswered(
+        self, bus: Bus, servo: IdentifiedServo, register: Register, value: int, deaf_s: float = 0.02
+    ) -> None:
         """Write and ignore the answer: its ID and baud rate depend on the firmware."""
         bus.write(servo.model, servo.id, register, register.bytes(value))
         bus.settle()
@@ -185,26 +189,26 @@ class EepromEditor:
     def _unlock(self, bus: Bus, servo: IdentifiedServo) -> None:
         """Unlock the servo's EEPROM; values written while it is locked are lost at power-off."""
         if LOCK in servo.model.layout:
-            self._tell(bus, servo, servo.model.layout[LOCK], 0)
+            self._write_unanswered(bus, servo, servo.model.layout[LOCK], 0)
 
-    def _locked(self, bus: Bus, done: Done) -> Done:
+    def _relock(self, bus: Bus, done: WriteResult) -> WriteResult:
         servo = done.change.servo
         if LOCK not in servo.model.layout or done.outcome is Outcome.UNKNOWN:
             return done
         if done.change.setting.name == ID and done.outcome is Outcome.WRITTEN:
-            servo = replace(servo, id=done.change.then)
+            servo = replace(servo, id=done.change.target)
         register = servo.model.layout[LOCK]
-        self._tell(bus, servo, register, 1)
+        self._write_unanswered(bus, servo, register, 1)
         data, _ = read_register(bus, servo.model, servo.id, register)
         if data == register.bytes(1):
             return done
-        said = "its EEPROM may still be unlocked: switch its supply off and on"
-        return replace(done, said="; ".join(filter(None, (done.said, said))))
+        remarks = "its EEPROM may still be unlocked: switch its supply off and on"
+        return replace(done, remarks="; ".join(filter(None, (done.remarks, remarks))))
 
 
-def _lost(change: Change, trouble: Trouble | None) -> Done:
-    said = f"{trouble} after it was written: look at the cable, then ask again with `bodyschema servos`"
-    return Done(change, Outcome.UNKNOWN, None, said)
+def _unknown_result(change: Change, trouble: Trouble | None) -> WriteResult:
+    remarks = f"{trouble} after it was written: look at the cable, then ask again with `bodyschema servos`"
+    return WriteResult(change, Outcome.UNKNOWN, None, remarks)
 
 
 def _read(bus: Bus, servo: IdentifiedServo, register: Register) -> int:

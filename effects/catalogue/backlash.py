@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import Effect, EffectSettings, SimulationRun
-from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, LiveDriven
+from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, LivePathElement
 from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
@@ -39,11 +39,11 @@ class Backlash(EncoderEffect):
         return ((wider - self.correction(motion, place, values)) / EffectSettings.step)[:, None]
 
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        return _played(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
+        return _cached_backlash(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
 
-    def live(self, place: Place, values: FloatArray, row_readings: int) -> LiveDriven:
+    def live(self, place: Place, values: FloatArray, row_readings: int) -> LivePathElement:
         width = float(values[0])
-        return LiveDriven(place, Play(abs(width)), float(np.sign(width)))
+        return LivePathElement(place, PlayOperator(abs(width)), float(np.sign(width)))
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return WIDTHS
@@ -63,7 +63,7 @@ class Backlash(EncoderEffect):
         return None
 
 
-class Play:
+class PlayOperator:
     """A backlash of a width [rad, m], driven reading by reading; its output moves once the input has crossed it."""
 
     def __init__(self, width: float) -> None:
@@ -81,7 +81,7 @@ class Play:
         return self._output - reading
 
 
-def played(q: FloatArray, width: float) -> FloatArray:
+def follow_backlash(q: FloatArray, width: float) -> FloatArray:
     """Return output minus input (n,) of a backlash of `width` driven by q (n,), leading in its first direction.
 
     Between two runs it is driven straight from the last reading of one to the first of the next: the side at the end of
@@ -100,6 +100,6 @@ def played(q: FloatArray, width: float) -> FloatArray:
 
 
 @lru_cache(maxsize=EncoderSettings.strains_kept)
-def _played(motion: Motion, joint: int, width: float) -> FloatArray:
-    """Return `played` of one joint; cached, since a search repeats the same widths."""
-    return frozen_array(played(motion.q[:, joint], width))
+def _cached_backlash(motion: Motion, joint: int, width: float) -> FloatArray:
+    """Return `follow_backlash` of one joint; cached, since a search repeats the same widths."""
+    return frozen_array(follow_backlash(motion.q[:, joint], width))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import Effect, SimulationRun
-from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, LiveDriven, carried_on
+from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, LivePathElement, decaying_sum
 from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
@@ -47,12 +47,12 @@ class Hysteresis(EncoderEffect):
         )
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        strained = _strained(motion, place.joint, float(values[1]))
-        return np.stack([-strained, np.zeros_like(strained)], axis=1)
+        strain = _cached_strain(motion, place.joint, float(values[1]))
+        return np.stack([-strain, np.zeros_like(strain)], axis=1)
 
-    def live(self, place: Place, values: FloatArray, row_readings: int) -> LiveDriven:
+    def live(self, place: Place, values: FloatArray, row_readings: int) -> LivePathElement:
         lag, length = values.tolist()
-        return LiveDriven(place, Bristle(length), -lag)
+        return LivePathElement(place, BristleModel(length), -lag)
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return _Settings.lengths
@@ -66,7 +66,7 @@ class Hysteresis(EncoderEffect):
         return run.motion.before_travel(run.simulation.place(effect).joint, travel)
 
 
-class Bristle:
+class BristleModel:
     """Friction strain from -1 to 1, driven reading by reading.
 
     Args:
@@ -76,22 +76,22 @@ class Bristle:
     def __init__(self, length: float) -> None:
         self._length = length
         self._last: float | None = None
-        self.strained = 0.0
+        self.strain = 0.0
 
     def begin(self, reading: float, leading: float) -> None:
         """Start at `reading`, reached in the direction of `leading`; 0 for no direction."""
-        self._last, self.strained = reading, float(np.sign(leading))
+        self._last, self.strain = reading, float(np.sign(leading))
 
     def follow(self, reading: float) -> float:
         """Return the strain at the next reading."""
         move = 0.0 if self._last is None else reading - self._last
         kept = float(np.exp(-abs(move) / self._length))
-        self._last, self.strained = reading, float(np.sign(move)) * (1.0 - kept) + kept * self.strained
-        return self.strained
+        self._last, self.strain = reading, float(np.sign(move)) * (1.0 - kept) + kept * self.strain
+        return self.strain
 
 
 @lru_cache(maxsize=EncoderSettings.strains_kept)
-def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
+def _cached_strain(motion: Motion, joint: int, length: float) -> FloatArray:
     """Return the strain of a joint's friction (n,), from -1 to 1; it begins in the direction of the first move.
 
     Between two runs it is driven straight, as a backlash is.
@@ -99,6 +99,6 @@ def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
     moves = np.diff(motion.q[:, joint], prepend=motion.q[0, joint])
     leading = moves[np.flatnonzero(moves)[:1]]
     kept = np.exp(-np.abs(moves) / length)
-    strained = np.sign(moves) * (1.0 - kept)
-    strained[0], kept[0] = float(np.sign(leading[0])) if len(leading) else 0.0, 0.0
-    return frozen_array(carried_on(strained, kept))
+    strain = np.sign(moves) * (1.0 - kept)
+    strain[0], kept[0] = float(np.sign(leading[0])) if len(leading) else 0.0, 0.0
+    return frozen_array(decaying_sum(strain, kept))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import Effect, SimulationRun
-from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, carried_on
+from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, decaying_sum
 from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
@@ -39,8 +39,8 @@ class Settling(EncoderEffect):
         return (Parameter("fraction", 0.05, never_negative=True), memory)
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        missing = _missing(motion, place.joint, float(values[1]))
-        return np.stack([-missing, np.zeros_like(missing)], axis=1)
+        shortfall = _cached_shortfall(motion, place.joint, float(values[1]))
+        return np.stack([-shortfall, np.zeros_like(shortfall)], axis=1)
 
     def live(self, place: Place, values: FloatArray, row_readings: int) -> _LiveSettling:
         return _LiveSettling(values, row_readings)
@@ -68,14 +68,14 @@ class Settling(EncoderEffect):
 
 
 @lru_cache(maxsize=EncoderSettings.strains_kept)
-def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
+def _cached_shortfall(motion: Motion, joint: int, memory: float) -> FloatArray:
     """Return the lag after the last and earlier moves (n,); cached, since a search repeats the same values."""
     moves = motion.moves[:, joint]
     if memory == 0.0:
         return moves
     kept = np.sign(memory) * abs(memory) ** motion.pace
     kept[motion.begins] = 0.0
-    return frozen_array(carried_on(moves, kept))
+    return frozen_array(decaying_sum(moves, kept))
 
 
 class _LiveSettling:
@@ -83,9 +83,9 @@ class _LiveSettling:
 
     def __init__(self, values: FloatArray, row_readings: int) -> None:
         self._fraction, self._memory = values.tolist()
-        self._missing: deque[float] = deque([0.0] * row_readings, maxlen=row_readings)
+        self._cached_shortfall: deque[float] = deque([0.0] * row_readings, maxlen=row_readings)
 
     def at(self, motion: Motion, move: float) -> float:
         """Return minus the remaining lag [rad, m] after the move since the previous row."""
-        self._missing.append(self._fraction * move + self._memory * self._missing[0])
-        return -self._missing[-1]
+        self._cached_shortfall.append(self._fraction * move + self._memory * self._cached_shortfall[0])
+        return -self._cached_shortfall[-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.effects.effect_type import Effect, SimulationRun, TimeEffect
-from bodyschema.effects.moments import settled, with_moment
+from bodyschema.effects.moments import drift_share, with_moment
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
@@ -34,7 +34,7 @@ class ThermalDrift(TimeEffect):
         return with_moment(self.growth(run.motion, effect.values[3])[:, None, None] * np.eye(3))
 
     def growth(self, motion: Motion, shape: float) -> FloatArray:
-        return settled(motion, float(shape))
+        return drift_share(motion, float(shape))
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return float(motion.clock[-1] - motion.clock[0]) * _Settings.time_constants

@@ -15,7 +15,7 @@ from bodyschema.effects.simulation import Simulation
 from bodyschema.robot.calibrated import CalibratedGeometry
 from bodyschema.robot.urdf import PointMass
 
-BORNE_BY_HAND = 'with hold = "torque_free" the guiding hand bore the weight'
+HELD_BY_HAND = 'with hold = "torque_free" the guiding hand bore the weight'
 WITHOUT_MASSES = "the URDF states no masses, so nothing pulls at the joint"
 
 
@@ -34,11 +34,11 @@ def sentences(left_out: Iterable[LeftOut]) -> list[str]:
         effect = each.effect
         source = "" if effect.source is None else f" from {effect.source}"
         places.setdefault((effect.name, each.why), []).append(f"{effect.where}{source}" if effect.where else "")
-    told = []
+    summary = []
     for (name, why), at in places.items():
         count = f"{len(at)} " if len(at) > 1 else ""
-        told.append(f"not in the file: {count}{name}{' at ' if at[0] else ''}{', '.join(dict.fromkeys(at))}: {why}")
-    return told
+        summary.append(f"not in the file: {count}{name}{' at ' if at[0] else ''}{', '.join(dict.fromkeys(at))}: {why}")
+    return summary
 
 
 def numbers(effect: Effect) -> str:
@@ -59,15 +59,15 @@ class ArmErrors:
 
     @classmethod
     def of(cls, simulation: Simulation) -> Self:
-        stayed = simulation.after_moments
+        permanent = simulation.with_permanent_changes
         joints = {joint: JointErrors() for joint in simulation.robot.joints}
         payloads: list[PointMass] = []
         left_out: list[LeftOut] = []
-        for effect in stayed.all_effects:
+        for effect in permanent.all_effects:
             if effect.kind.rigid and not effect.kind.is_zero:
                 continue
             if effect.kind.needs_weight and not simulation.bears_weight:
-                why = BORNE_BY_HAND
+                why = HELD_BY_HAND
             elif effect.kind.needs_weight and not simulation.gravity.known:
                 why = WITHOUT_MASSES
             elif isinstance(effect.kind, StructureEffect) and (mass := effect.kind.point_mass(effect.values)):
@@ -79,12 +79,12 @@ class ArmErrors:
                 why = effect.kind.add_to(joints[effect.where], effect)
             if why is not None:
                 left_out.append(LeftOut(effect, why))
-        return cls(stayed, joints, tuple(payloads), tuple(left_out), tuple(moment_notes(simulation)))
+        return cls(permanent, joints, tuple(payloads), tuple(left_out), tuple(moment_notes(simulation)))
 
-    def told(self) -> list[str]:
+    def summary(self) -> list[str]:
         """Return sentences on effects that are not in the file, or in another form."""
-        told = sentences(self.left_out)
-        return [*told, *residual_note(self.simulation), *self.notes]
+        summary = sentences(self.left_out)
+        return [*summary, *residual_note(self.simulation), *self.notes]
 
 
 def residual_note(simulation: Simulation) -> list[str]:

@@ -20,7 +20,7 @@ from bodyschema.effects.simulation import Simulation, SimulationSettings
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
-from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
+from .arm_errors import HELD_BY_HAND, LeftOut, moment_notes, residual_note, sentences
 
 FORMAT = "bodyschema correction 3"
 PACE, POSE, ANGLES = 2, 3, 15  # Registers that every file has: 0 is the number of joints, 1 of registers
@@ -30,21 +30,21 @@ OUTWARDS_THREE = OUTWARDS + 2
 WIDEST = 12  # behind the last register, so that a step finds all that it takes in a row
 
 
-def held_by_correction(simulation: Simulation) -> Simulation:
+def supported_effects(simulation: Simulation) -> Simulation:
     """Return the simulation with only the effects that correction.json holds."""
-    stayed = simulation.after_moments
+    permanent = simulation.with_permanent_changes
     own, background = (
-        tuple(effect for effect in effects if _why_not(stayed, effect) is None)
-        for effects in (stayed.effects, stayed.background)
+        tuple(effect for effect in effects if _reason_left_out(permanent, effect) is None)
+        for effects in (permanent.effects, permanent.background)
     )
     return Simulation(simulation.robot, own, None, background)
 
 
-def _why_not(simulation: Simulation, effect: Effect) -> str | None:
+def _reason_left_out(simulation: Simulation, effect: Effect) -> str | None:
     """Return the reason why the format cannot hold an effect; None if it can."""
     kind = effect.kind
     if kind.needs_weight and not simulation.bears_weight:
-        return BORNE_BY_HAND
+        return HELD_BY_HAND
     held = kind.rigid or kind.is_spring or kind.is_load or _rows(simulation, effect) is not None
     return None if held else kind.no_counterpart
 
@@ -68,8 +68,8 @@ def write_correction(
     Raises:
         OSError: the file cannot be written.
     """
-    kept, stayed = held_by_correction(simulation), simulation.after_moments
-    reasons = [(effect, _why_not(stayed, effect)) for effect in stayed.all_effects]
+    kept, permanent = supported_effects(simulation), simulation.with_permanent_changes
+    reasons = [(effect, _reason_left_out(permanent, effect)) for effect in permanent.all_effects]
     left_out = [LeftOut(effect, why) for effect, why in reasons if why is not None]
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
     program = _Program(len(simulation.robot.joints))

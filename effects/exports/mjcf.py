@@ -26,7 +26,7 @@ from bodyschema.effects.joint_errors import JointErrors, Wave
 from bodyschema.effects.simulation import Simulation
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.urdf import MOVING, UrdfJoint, standing
+from bodyschema.robot.urdf import MOVING, UrdfJoint, fixed_transform
 
 from .arm_errors import ArmErrors, numbers
 from .link_parts import LinkParts, PartSettings, placed, rod, texts
@@ -66,9 +66,9 @@ def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
         OSError: the file cannot be written.
     """
     document = _Document(simulation, file.parent)
-    told = document.told
-    file.write_bytes(document.written([heading, *told]))
-    return told
+    summary = document.summary
+    file.write_bytes(document.written([heading, *summary]))
+    return summary
 
 
 @dataclass
@@ -103,23 +103,27 @@ class _Document:
         children = {joint.child for joint in self._tree.joints.values()}
         base = next(link for link in self._tree.links if link not in children)
         self._link(self._world, base, np.eye(4), None)
-        self._keep_left_out()
+        self._note_left_out()
 
     @property
-    def told(self) -> list[str]:
-        told = self._errors.told()
+    def summary(self) -> list[str]:
+        summary = self._errors.summary()
         if self._parts.unreadable:
             some = ", ".join(self._parts.unreadable[:3]) + (", ..." if len(self._parts.unreadable) > 3 else "")
-            told.append(f"not in the file: {len(self._parts.unreadable)} meshes ({some}): missing, or not STL or OBJ")
+            summary.append(
+                f"not in the file: {len(self._parts.unreadable)} meshes ({some}): missing, or not STL or OBJ"
+            )
         if not self.simulation.gravity.known:
-            told.append("the URDF states no masses: those of the file are placeholders, so its dynamics mean nothing")
-        return told
+            summary.append(
+                "the URDF states no masses: those of the file are placeholders, so its dynamics mean nothing"
+            )
+        return summary
 
-    def written(self, told: list[str]) -> bytes:
+    def written(self, summary: list[str]) -> bytes:
         """Return the file's content, with sentences at its top."""
         etree = self._etree
         lines = [
-            *told,
+            *summary,
             "The value of each joint is what its encoder reads. Positions of the measurement are those of the site "
             f"{MARKER} in the frame of the site {MEASUREMENT}.",
             "At rest the arm stands as found. Armature, damping, gains and friction were chosen, not measured.",
@@ -176,7 +180,7 @@ class _Document:
                 self._link(body, joint.child, T_child, joint)
             else:
                 held = self._robot.robot.held_at.get(joint.name, 0.0)
-                self._link(body, joint.child, standing(joint, False, held), None)
+                self._link(body, joint.child, fixed_transform(joint, False, held), None)
 
     def _payloads(self, body: Any) -> None:
         for count, payload in enumerate(self._errors.payloads):
@@ -351,7 +355,7 @@ class _Document:
             ends += [(other.child, T @ other.T_parent_joint) for other in below]
         return total
 
-    def _keep_left_out(self) -> None:
+    def _note_left_out(self) -> None:
         """Store the numbers of effects that the file cannot hold, for programs that know them."""
         for count, left_out in enumerate(self._errors.left_out):
             effect = left_out.effect

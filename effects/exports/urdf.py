@@ -22,9 +22,9 @@ def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     Raises:
         OSError: the file cannot be written.
     """
-    robot, stayed = simulation.robot, simulation.after_moments
-    geometry = geometry_of(stayed)
-    left_out = [LeftOut(effect, _WHY_NOT) for effect in stayed.all_effects if not effect.kind.rigid]
+    robot, permanent = simulation.robot, simulation.with_permanent_changes
+    geometry = geometry_of(permanent)
+    left_out = [LeftOut(effect, _WHY_NOT) for effect in permanent.all_effects if not effect.kind.rigid]
     told = [*sentences(left_out), *residual_note(simulation), *moment_notes(simulation)]
     file.write_bytes(calibrated_urdf(robot, geometry, file.parent, "\n".join([heading, *told])))
     return told

@@ -136,7 +136,7 @@ class ChainBelief:
         evidence = float(np.log(wide[free] / narrow[free]).sum() - np.log(np.diag(factor)).sum())
         return type(self)(self.parameters, mean, root, self.noise), evidence - 0.5 * float(self.mean @ (added * mean))
 
-    def among(self, beliefs: Sequence[ChainBelief], shares: ArrayLike) -> Self:
+    def with_mixture_covariance(self, beliefs: Sequence[ChainBelief], shares: ArrayLike) -> Self:
         """Return this chain with the uncertainty of a mixture: the mixture's second moment about this mean.
 
         Args:

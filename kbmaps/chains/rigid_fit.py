@@ -46,7 +46,7 @@ class NoiseKnowledge:
         return (square + self.coordinates * self.square) / (freedom + self.coordinates)
 
 
-NOTHING_KNOWN = NoiseKnowledge()
+NO_NOISE_KNOWLEDGE = NoiseKnowledge()
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,13 +130,13 @@ class _Fitter:
         squares = np.square(np.linalg.svd(design, compute_uv=False))
         self.used = float((squares / (1.0 + squares)).sum())  # γ of MacKay 1992, "Bayesian interpolation"
         while self._damping <= _Settings.most_damping:
-            held = np.sqrt(1.0 + self._damping * columns)
-            q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
-            projected = q.T @ np.concatenate([target, -point.offset / held])
+            damping_rows = np.sqrt(1.0 + self._damping * columns)
+            q, r = np.linalg.qr(np.concatenate([design, np.diag(damping_rows)]))
+            projected = q.T @ np.concatenate([target, -point.offset / damping_rows])
             length = float(np.linalg.norm(projected))
-            tried = self._at(point.offset + np.linalg.solve(r, projected))
-            if tried.cost(roots) <= before:
-                self.point, self._damping = tried, max(self._damping * 0.1, _Settings.least_damping)
+            trial = self._at(point.offset + np.linalg.solve(r, projected))
+            if trial.cost(roots) <= before:
+                self.point, self._damping = trial, max(self._damping * 0.1, _Settings.least_damping)
                 return length
             if length < _Settings.small_step:
                 return 0.0
@@ -155,7 +155,12 @@ class _Fitter:
 
 
 def fit_chain(
-    prior: ChainBelief, pairs: Pairs, start: FloatArray, *, near: bool = False, noise: NoiseKnowledge = NOTHING_KNOWN
+    prior: ChainBelief,
+    pairs: Pairs,
+    start: FloatArray,
+    *,
+    near: bool = False,
+    noise: NoiseKnowledge = NO_NOISE_KNOWLEDGE,
 ) -> RigidFit:
     """Fit the most probable change to at least one pair, starting from `start` (size,).
 
@@ -195,8 +200,8 @@ def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -
     point = _Fitter(prior, pairs, change).point
     factor = point.reduced(1.0 / (pairs.unit * noise))
     free, root = squared(prior.root)
-    held = np.concatenate([np.eye(len(free)), -point.offset[:, None]], axis=1)
-    joined = cast(FloatArray, np.linalg.qr(np.concatenate([factor, held]), mode="r"))
+    prior_rows = np.concatenate([np.eye(len(free)), -point.offset[:, None]], axis=1)
+    joined = cast(FloatArray, np.linalg.qr(np.concatenate([factor, prior_rows]), mode="r"))
     triangle, target = joined[: len(free), :-1], joined[: len(free), -1]
     mean, spread = prior.mean.copy(), np.zeros((len(prior.mean), len(free)))
     mean[free] += root @ (point.offset + np.linalg.solve(triangle, target))
@@ -215,7 +220,7 @@ def _anneal(fitter: _Fitter) -> None:
             return
 
 
-def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
+def _polish(fitter: _Fitter, prior_noise: NoiseKnowledge) -> RigidFit:
     pairs = fitter.pairs
     typical = fitter.typical()
     inliers = fitter.point.norms <= RobustSettings.outlier_sigmas * typical
@@ -226,7 +231,9 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
         step = fitter.improve(inliers.astype(np.float64), noise)
         freedom = max(3.0 * float(inliers.sum()) - fitter.used, 0.0)
         square = float(np.square(fitter.point.norms[inliers]).sum())
-        estimate = _told_noise(square, freedom) if pairs.known else _found_noise(square, freedom, before, fitter)
+        estimate = (
+            _given_noise(square, freedom) if pairs.known else _estimated_noise(square, freedom, prior_noise, fitter)
+        )
         distances = fitter.point.deletion_distances(inliers, pairs.unit * max(estimate, fitter.typical()))
         chosen = distances <= RobustSettings.outlier_sigmas
         settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
@@ -236,13 +243,13 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     return _summary(fitter, inliers, noise, freedom)
 
 
-def _found_noise(square: float, freedom: float, before: NoiseKnowledge, fitter: _Fitter) -> float:
-    if freedom + before.coordinates == 0.0:
+def _estimated_noise(square: float, freedom: float, prior_noise: NoiseKnowledge, fitter: _Fitter) -> float:
+    if freedom + prior_noise.coordinates == 0.0:
         return fitter.least_noise
-    return max(math.sqrt(before.found(square, freedom)), fitter.least_noise)
+    return max(math.sqrt(prior_noise.found(square, freedom)), fitter.least_noise)
 
 
-def _told_noise(square: float, freedom: float) -> float:
+def _given_noise(square: float, freedom: float) -> float:
     """Return 1, or more if the residuals exceed chance: then the chain does not fit."""
     if freedom == 0.0 or chdtrc(freedom, square) >= _Settings.misfit_chance:
         return 1.0

@@ -29,16 +29,18 @@ from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
-from kbmaps.variance_components import error_covariances, inverse_roots, tells_directions
+from kbmaps.variance_components import error_covariances, inverse_roots, is_anisotropic
 
 
 class _Settings:
     open: float = 0.5  # a direction is open if at least this share of the prior's variance remains
     # No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
     longest_step: float = 0.1
-    followed: int = 100  # the curvature of the posterior is estimated from about this many evenly spread pairs
+    max_followed_pairs: int = (
+        100  # the curvature of the posterior is estimated from about this many evenly spread pairs
+    )
     # A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
-    hardly_narrower: float = 0.5
+    min_remaining_share: float = 0.5
 
 
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
@@ -82,9 +84,9 @@ def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatA
     root[free] = triangle
     _, jacobian = belief.parameters.linearised(belief.mean, pairs.q)
     rows = (pairs.whitened(jacobian[:, :, free] @ triangle) / sigma[:, None, None]).reshape(-1, len(free))
-    taken, vectors = np.linalg.eigh(rows.T @ rows)
-    opened, closed = vectors[:, taken <= 1.0 - _Settings.open], vectors[:, taken > 1.0 - _Settings.open]
-    follow = (rows @ closed / taken[taken > 1.0 - _Settings.open]).T
+    removed_share, vectors = np.linalg.eigh(rows.T @ rows)
+    opened, closed = vectors[:, removed_share <= 1.0 - _Settings.open], vectors[:, removed_share > 1.0 - _Settings.open]
+    follow = (rows @ closed / removed_share[removed_share > 1.0 - _Settings.open]).T
     return root @ opened, root @ closed, follow
 
 
@@ -123,7 +125,7 @@ class RigidLearner(Model):
     def __init__(self, nominal: RigidChain, tolerances: ChainTolerances, prior: ChainBelief | None = None) -> None:
         self._parameters = ChainParameters(nominal)
         self._tolerances = tolerances
-        self._told_prior = prior is not None
+        self._prior_given = prior is not None
         if prior is None:
             self._prior = ChainBelief.from_tolerances(self._parameters, tolerances)
         else:
@@ -267,18 +269,18 @@ class RigidLearner(Model):
         Raises:
             ShapeError: they belong to other pairs.
         """
-        told = numbers("stated", stated)
-        if told.shape != (self.pairs, 3, 3):
-            raise ShapeError("stated", f"({self.pairs}, 3, 3)", told.shape)
-        if not tells_directions(told):
+        covariances = numbers("stated", stated)
+        if covariances.shape != (self.pairs, 3, 3):
+            raise ShapeError("stated", f"({self.pairs}, 3, 3)", covariances.shape)
+        if not is_anisotropic(covariances):
             return
-        alike = Pairs(self._q, self._x, np.ones(self.pairs), False, None, self._common)
-        change, errors = rough_fit(self._prior, alike, self._start())
+        unweighted = Pairs(self._q, self._x, np.ones(self.pairs), False, None, self._common)
+        change, errors = rough_fit(self._prior, unweighted, self._start())
         _, jacobian = self._parameters.linearised(change, self._q)
         readings = jacobian[:, :, self._parameters.zeros][:, :, ~self.nominal.prismatic]
-        found = error_covariances(errors, told, readings)
+        estimated = error_covariances(errors, covariances, readings)
         self._sigma = np.full(self.pairs, np.nan)
-        self._shape = math.sqrt(float(np.trace(found, axis1=1, axis2=2).mean()) / 3.0) * inverse_roots(found)
+        self._shape = math.sqrt(float(np.trace(estimated, axis1=1, axis2=2).mean()) / 3.0) * inverse_roots(estimated)
         self._take(fit_chain(self._prior, self.data, change, near=True))
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -311,7 +313,7 @@ class RigidLearner(Model):
             self._parameters,
             fit.belief.mean,
             widening * self._deviations(fit, pairs),
-            (after > _Settings.hardly_narrower * before) & (before * lever > (scatter.noise * scatter.misfit)),
+            (after > _Settings.min_remaining_share * before) & (before * lever > (scatter.noise * scatter.misfit)),
             scatter=scatter,
             widening=widening,
             outliers=int((~fit.inliers).sum()),
@@ -328,7 +330,7 @@ class RigidLearner(Model):
         arrays = chain_arrays(self.nominal) | self.stored()
         if self._common.any():
             arrays["common"] = self._common
-        if self._told_prior:
+        if self._prior_given:
             arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
         return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances)}, arrays)
 
@@ -383,10 +385,10 @@ class RigidLearner(Model):
         self._fit, self._widest = fit, widest(variance)
 
     def _deviations(self, fit: RigidFit, pairs: Pairs) -> FloatArray:
-        good = np.flatnonzero(fit.inliers)
-        some = good[:: max(len(good) // _Settings.followed, 1)]
-        sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
-        return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), some)), sigma)
+        inlier_rows = np.flatnonzero(fit.inliers)
+        sample = inlier_rows[:: max(len(inlier_rows) // _Settings.max_followed_pairs, 1)]
+        sigma = fit.noise * pairs.unit[sample] * math.sqrt(len(sample) / max(len(inlier_rows), 1))
+        return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), sample)), sigma)
 
     def _start(self) -> FloatArray:
-        return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)
+        return self._prior.mean if self._prior_given else self._place.change(self._q, self._x)

@@ -23,7 +23,7 @@ from kbmaps.chains.parameters import (
     parse_tolerances,
 )
 from kbmaps.chains.rigid_filter import FilterSettings, RigidFilter
-from kbmaps.chains.rigid_fit import NOTHING_KNOWN, NoiseKnowledge, RigidFit, fit_chain, folded
+from kbmaps.chains.rigid_fit import NO_NOISE_KNOWLEDGE, NoiseKnowledge, RigidFit, fit_chain, folded
 from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack
@@ -63,7 +63,7 @@ class RigidWindow:
         self.size = size
         # posterior of the chain before the kept pairs
         self.belief = ChainBelief.from_tolerances(parameters, tolerances)
-        self.noise = NOTHING_KNOWN  # noise estimated before them, from pairs that came without their sigma
+        self.noise = NO_NOISE_KNOWLEDGE  # noise estimated before them, from pairs that came without their sigma
         # variance [m²] of a coordinate that the chain did not explain at the last fit, with the noise given
         self.excess = 0.0
         self._begun = False
@@ -125,8 +125,8 @@ class RigidWindow:
         self.farthest = candidates[np.argsort(-variance.sum(axis=1))[:1]]
         self.belief = folded(self.belief, pairs.chosen(good), fit.belief.mean, fit.noise)
         if not pairs.known:
-            told = self.noise.coordinates + fit.freedom * count / self._count
-            self.noise = NoiseKnowledge(min(told, FilterSettings.noise_memory), fit.noise**2)
+            given = self.noise.coordinates + fit.freedom * count / self._count
+            self.noise = NoiseKnowledge(min(given, FilterSettings.noise_memory), fit.noise**2)
         self._begun = True
         self._count -= count
         self._rows[: self._count] = self._rows[count : count + self._count].copy()
@@ -300,7 +300,7 @@ class RecursiveRigidLearner(Model):
         """
         require_positive("tolerance", tolerance, unit=" m")
         if self.kept >= _Settings.first:
-            self._window.fold(self._set_right(), self.kept)
+            self._window.fold(self._correct_filter(), self.kept)
         before = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
         belief = before.with_other_tool(tolerance)
         self._filter.go_on_from(belief, fitted=False)
@@ -348,7 +348,7 @@ class RecursiveRigidLearner(Model):
         return learner
 
     def _refit(self) -> None:
-        fit = self._set_right()
+        fit = self._correct_filter()
         if self.kept == self._window.size:
             self._window.fold(fit, self.kept // 2)
             self._due = self._window.size
@@ -357,7 +357,7 @@ class RecursiveRigidLearner(Model):
         else:
             self._due = min(math.ceil(_Settings.growth * self.kept), self._window.size)
 
-    def _set_right(self) -> RigidFit:
+    def _correct_filter(self) -> RigidFit:
         """Set the filter to a fit of the kept pairs, and return the fit."""
         fit = self._window.fitted(self._filter.change)
         self._filter.go_on_from(fit.belief, fitted=True)

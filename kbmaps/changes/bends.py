@@ -48,7 +48,7 @@ class BendSettings:
 
 
 # Log evidence of other pairs about bends of each length, without any such pairs.
-NOTHING_SEEN = (0.0,) * len(BendSettings.lengths)
+NO_EVIDENCE = (0.0,) * len(BendSettings.lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +225,7 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     return np.concatenate(columns, axis=2)
 
 
-def log_ratios_if_it_bends(
+def log_ratios_if_bending(
     angles: FloatArray,
     errors: FloatArray,
     known: FloatArray,
@@ -279,7 +279,7 @@ def log_evidence_of_bends(
 ) -> list[FloatArray]:
     """Return the evidence about bends in pairs to which the belief was fitted.
 
-    Arguments as in `log_ratios_if_it_bends`.
+    Arguments as in `log_ratios_if_bending`.
     """
     starts = np.arange(0, len(angles), BendSettings.longest_run)
     return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts, fitted=True))

@@ -11,7 +11,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.changes.bends import NOTHING_SEEN, BendSettings, log_evidence_of_bends, log_ratios_if_it_bends
+from kbmaps.changes.bends import NO_EVIDENCE, BendSettings, log_evidence_of_bends, log_ratios_if_bending
 from kbmaps.changes.kinds import JOINT, ChangeKind, KindSettings, change_kinds, log_ratios
 from kbmaps.changes.white_noise import SharedNoise
 from kbmaps.robust import RobustSettings
@@ -27,12 +27,12 @@ class DetectorSettings:
     overshoot: float = 0.33
     # Number of the newest pairs that decide if the noise has grown.
     recent: int = 50
-    clearly: float = 3.0
+    clear_sigmas: float = 3.0
     # Normally the statistic is evaluated once per this many pairs. After a pair beyond this many sigmas, or at log odds
     # above this, it is evaluated for each pair.
-    look_every: int = 5
-    strange_sigmas: float = 3.0
-    look_closely: float = 4.0
+    evaluate_every: int = 5
+    outlier_sigmas: float = 3.0
+    evaluate_each_above: float = 4.0
     # Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
     pairs_between_false_alarms: float = 75_000.0
     most_surprises: int = 3000  # number of the newest errors that are kept
@@ -176,9 +176,9 @@ class ChangeDetector:
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
         self._differences: deque[float] = deque(maxlen=DetectorSettings.recent)
-        self._surprises: deque[FloatArray] = deque(maxlen=DetectorSettings.most_surprises)
+        self._whitened_errors: deque[FloatArray] = deque(maxlen=DetectorSettings.most_surprises)
         self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=BendSettings.most_pairs)
-        self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
+        self._last_is_outlier, self._evaluated_at, self._log_odds = False, 0, -math.inf
         self._fitted: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._bends_before: list[FloatArray] | None = None
 
@@ -198,13 +198,13 @@ class ChangeDetector:
         return self._noise
 
     @property
-    def surprises(self) -> FloatArray:
+    def whitened_errors(self) -> FloatArray:
         """Whitened errors (n, 3) of the newest pairs, n at most `DetectorSettings.most_surprises`.
 
         Each is against the prediction from the pairs before it. They are in units of the noise, without the model's own
         uncertainty.
         """
-        return np.array(self._surprises).reshape(-1, 3)
+        return np.array(self._whitened_errors).reshape(-1, 3)
 
     def add(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
         """Add pairs later than those that the model was fitted to, in order.
@@ -219,7 +219,7 @@ class ChangeDetector:
             self._rows.append(row)
             self._add(*row[1:])
 
-    def recall(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
+    def set_fitted_pairs(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
         """Set the pairs to which the belief was fitted, in order: they only show the arm's bends.
 
         Args:
@@ -242,30 +242,35 @@ class ChangeDetector:
 
     def _add(self, known: FloatArray, changed: FloatArray, error: FloatArray) -> None:
         """Add one pair: whitened derivatives by the belief (3, k) and by changes (3, c), and its error (3,)."""
-        expected, seen = known @ self._mean, known @ self._posterior_root
-        covariance = seen @ seen.T
+        expected, root = known @ self._mean, known @ self._posterior_root
+        covariance = root @ root.T
         spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
-        off = error - expected
-        off = off * min(1.0, RobustSettings.clipped_sigmas * spread / max(float(np.linalg.norm(off)), 1e-300))
-        if self._surprises:
-            apart = float(np.square(off * math.sqrt(self._noise.single) / spread - self._surprises[-1]).mean()) / 2.0
-            self._differences.append(apart)
-        self._surprises.append(off * math.sqrt(self._noise.single) / spread)
-        error = expected + off
-        self._strange = float(np.linalg.norm(off)) > DetectorSettings.strange_sigmas * spread
+        innovation = error - expected
+        innovation = innovation * min(
+            1.0, RobustSettings.clipped_sigmas * spread / max(float(np.linalg.norm(innovation)), 1e-300)
+        )
+        if self._whitened_errors:
+            half_square = (
+                float(np.square(innovation * math.sqrt(self._noise.single) / spread - self._whitened_errors[-1]).mean())
+                / 2.0
+            )
+            self._differences.append(half_square)
+        self._whitened_errors.append(innovation * math.sqrt(self._noise.single) / spread)
+        error = expected + innovation
+        self._last_is_outlier = float(np.linalg.norm(innovation)) > DetectorSettings.outlier_sigmas * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
-        step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), seen)
-        self._mean = self._mean + self._posterior_root @ (off @ step)
-        _, lengths, directions = np.linalg.svd(seen, full_matrices=False)
-        lost = 1.0 - np.sqrt(self._noise.whole / (np.square(lengths) + self._noise.whole))
-        self._posterior_root = self._posterior_root - (self._posterior_root @ directions.T * lost) @ directions
+        step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), root)
+        self._mean = self._mean + self._posterior_root @ (innovation @ step)
+        _, lengths, directions = np.linalg.svd(root, full_matrices=False)
+        shrinkage = 1.0 - np.sqrt(self._noise.whole / (np.square(lengths) + self._noise.whole))
+        self._posterior_root = self._posterior_root - (self._posterior_root @ directions.T * shrinkage) @ directions
 
     @property
     def due(self) -> bool:
-        """True if `suspicion` may have grown enough to be worth evaluating."""
-        late = self.pairs - self._looked_at >= DetectorSettings.look_every
-        return self.pairs > self._looked_at and (
-            late or self._strange or self._log_odds > DetectorSettings.look_closely
+        """True if `change_score` may have grown enough to be worth evaluating."""
+        late = self.pairs - self._evaluated_at >= DetectorSettings.evaluate_every
+        return self.pairs > self._evaluated_at and (
+            late or self._last_is_outlier or self._log_odds > DetectorSettings.evaluate_each_above
         )
 
     def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -284,25 +289,25 @@ class ChangeDetector:
         information = (information - explained) / variances[:, None, None]
         return onsets, information, (score - np.matvec(crossed.transpose(0, 2, 1), self._mean)) / variances[:, None]
 
-    def suspicion(self) -> ChangeScore:
+    def change_score(self) -> ChangeScore:
         """Return the probability of a change after the pairs so far, at least one."""
         onsets, information, score = self.sums()
         terms = np.stack([log_ratios(information[:, at, at], score[:, at], self._sizes) for at in self._places], axis=1)
         terms += self._log_shares + np.log(self._onsets.weights)[:, None]
-        suspicion = self._suspected(onsets, terms)
-        self._looked_at, self._log_odds = self.pairs, suspicion.log_odds
-        return suspicion
+        change_score = self._score_of_terms(onsets, terms)
+        self._evaluated_at, self._log_odds = self.pairs, change_score.log_odds
+        return change_score
 
-    def suspicion_if_it_bends(self) -> ChangeScore:
+    def score_if_bending(self) -> ChangeScore:
         """Return the probability of a change if the arm may bend, before and after; at least one pair.
 
-        The bends are those that the pairs make probable. It costs some hundred times as much as `suspicion`: use it
+        The bends are those that the pairs make probable. It costs some hundred times as much as `change_score`: use it
         only after its alarm.
         """
         angles, known, changed, errors = (np.array(each) for each in zip(*self._rows, strict=True))
         scale = 1.0 / math.sqrt(self._noise.single)
         first = self.pairs - len(angles)
-        onsets, stands_for, terms = log_ratios_if_it_bends(
+        onsets, onset_weights, terms = log_ratios_if_bending(
             angles,
             scale * errors,
             scale * known,
@@ -310,16 +315,16 @@ class ChangeDetector:
             scale * changed,
             self._places,
             self._sizes,
-            max(self.suspicion().onset - first, 0),
-            self._seen_of_bends(),
+            max(self.change_score().onset - first, 0),
+            self._evidence_of_bends(),
         )
-        terms = terms + self._log_shares + np.log(stands_for)[:, None]
-        return self._suspected(onsets + first, terms)
+        terms = terms + self._log_shares + np.log(onset_weights)[:, None]
+        return self._score_of_terms(onsets + first, terms)
 
-    def _seen_of_bends(self) -> Sequence[FloatArray | float]:
+    def _evidence_of_bends(self) -> Sequence[FloatArray | float]:
         """Return the evidence about bends in the pairs to which the belief was fitted."""
         if self._fitted is None:
-            return NOTHING_SEEN
+            return NO_EVIDENCE
         if self._bends_before is None:
             scale = 1.0 / math.sqrt(self._noise.single)
             angles, known, changed, errors = self._whitened(*self._fitted)
@@ -327,7 +332,7 @@ class ChangeDetector:
             self._bends_before = log_evidence_of_bends(angles, scale * errors, scale * known, turning)
         return self._bends_before
 
-    def _suspected(self, onsets: IntArray, terms: FloatArray) -> ChangeScore:
+    def _score_of_terms(self, onsets: IntArray, terms: FloatArray) -> ChangeScore:
         log_odds = float(np.logaddexp.reduce(terms, axis=None))
         shares = np.exp(terms - log_odds)
         return ChangeScore(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
@@ -336,5 +341,5 @@ class ChangeDetector:
         """Return the noise, or more if the newest pairs scatter more, since that is not a change of the arm."""
         if len(self._differences) < DetectorSettings.recent:
             return self._noise
-        chance = 1.0 + DetectorSettings.clearly * math.sqrt(1.0 / DetectorSettings.recent)
+        chance = 1.0 + DetectorSettings.clear_sigmas * math.sqrt(1.0 / DetectorSettings.recent)
         return self._noise.times(max(1.0, float(np.mean(self._differences)) / (self._noise.single * chance)))

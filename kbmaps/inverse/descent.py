@@ -135,13 +135,13 @@ def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange
     return Descent(q, error, steps, portion <= _Settings.least_portion)
 
 
-def _square(way: FloatArray, joints: JointRange) -> float:
-    return float(np.square(way / joints.scale).sum())
+def _square(step: FloatArray, joints: JointRange) -> float:
+    return float(np.square(step / joints.scale).sum())
 
 
 def bounded_step(
     jacobian: FloatArray,
-    wanted: FloatArray,
+    target: FloatArray,
     damping_square: float,
     bounds: tuple[FloatArray, FloatArray],
     preferred: FloatArray,
@@ -155,7 +155,7 @@ def bounded_step(
 
     Args:
         jacobian: J (m, d), m = 3 for a position [m/rad] or 6 for a pose.
-        wanted: e (m,) [m].
+        target: e (m,) [m].
         damping_square: greater than 0.
         bounds: smallest and largest step of each joint (d,).
         preferred: step (d,) that the null space of J follows.
@@ -163,14 +163,14 @@ def bounded_step(
     """
     low, high = bounds
     free = np.ones(len(preferred), dtype=np.bool_)
-    trial = _unbounded_step(jacobian, wanted, damping_square, preferred, scale, free)
+    trial = _unbounded_step(jacobian, target, damping_square, preferred, scale, free)
     step = np.clip(trial, low, high)
     if (step == trial).all():
         return step
     free = step == trial
     for _ in range(_Settings.rounds_a_joint * len(preferred)):
         base = np.where(free, preferred, step)
-        trial = _unbounded_step(jacobian, wanted, damping_square, base, scale, free)
+        trial = _unbounded_step(jacobian, target, damping_square, base, scale, free)
         inside = np.clip(trial, low, high)
         passed = free & (inside != trial)
         if passed.any():
@@ -184,7 +184,7 @@ def bounded_step(
         step = inside
         # Half the cost's slope in the scaled joints; a held joint is released where the slope points away from its
         # bound.
-        slope = damping_square * (step - preferred) / scale - scale * (jacobian.T @ (wanted - jacobian @ step))
+        slope = damping_square * (step - preferred) / scale - scale * (jacobian.T @ (target - jacobian @ step))
         gain = np.where(free | (low == high), 0.0, np.where(step <= low, -slope, slope))
         best = int(gain.argmax())
         if gain[best] <= _Settings.rounding_slope * float(np.abs(slope).max()):
@@ -195,7 +195,7 @@ def bounded_step(
 
 def _unbounded_step(
     jacobian: FloatArray,
-    wanted: FloatArray,
+    target: FloatArray,
     damping_square: float,
     base: FloatArray,
     scale: FloatArray,
@@ -205,4 +205,4 @@ def _unbounded_step(
     scaled = jacobian * (scale * free)
     gram = scaled @ scaled.T
     np.einsum("ii->i", gram)[:] += damping_square
-    return base + scale * (scaled.T @ cast(FloatArray, np.linalg.solve(gram, wanted - jacobian @ base)))
+    return base + scale * (scaled.T @ cast(FloatArray, np.linalg.solve(gram, target - jacobian @ base)))

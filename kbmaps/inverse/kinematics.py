@@ -206,22 +206,22 @@ class InverseKinematics:
         """
         goal = self._goal(vector("x", x, 3), rotation)
         first = None if start is None else vector("start", start, self._model.joints)
-        wanted = None if posture is None else vector("posture", posture, self._model.joints)
+        target = None if posture is None else vector("posture", posture, self._model.joints)
         best, steps, tried = self._search(goal, first)
-        if wanted is not None and goal.reached(best.error):
-            before, best = best, settle(goal, best, wanted, self._joints, self._max_steps)
+        if target is not None and goal.reached(best.error):
+            before, best = best, settle(goal, best, target, self._joints, self._max_steps)
             steps += best.steps - before.steps
         return self._solution(goal, best, steps, tried)
 
     def _goal(self, x: FloatArray, rotation: ArrayLike | None) -> PositionGoal | PoseGoal:
         if rotation is None:
             return PositionGoal(self._model, x, self._tolerance)
-        wanted = rotation_matrices("rotation", rotation)
-        if wanted.shape != (3, 3):
-            raise ShapeError("rotation", "(3, 3), or (4,) for a quaternion", wanted.shape)
+        target = rotation_matrices("rotation", rotation)
+        if target.shape != (3, 3):
+            raise ShapeError("rotation", "(3, 3), or (4,) for a quaternion", target.shape)
         if not isinstance(self._model, PoseModel):
             raise SettingError(f"a {type(self._model).__name__} gives no orientation; ask for the position alone")
-        return PoseGoal(self._model, x, wanted, self.lever, self._tolerance, self._angle_tolerance)
+        return PoseGoal(self._model, x, target, self.lever, self._tolerance, self._angle_tolerance)
 
     def _search(self, goal: PositionGoal | PoseGoal, first: FloatArray | None) -> tuple[Descent, int, int]:
         """Return the best descent, the steps of all, and the number of starts tried."""

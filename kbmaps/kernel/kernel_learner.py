@@ -216,7 +216,7 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
     step = _Settings.slope_step
     steps = step * np.eye(len(bases))
     flat = angles.reshape(-1, 1, len(bases))
-    ahead, behind = (model.predict((flat + way * steps).reshape(-1, len(bases))) for way in (1.0, -1.0))
+    ahead, behind = (model.predict((flat + direction * steps).reshape(-1, len(bases))) for direction in (1.0, -1.0))
     lengths = np.array([2.0 * (step if basis.is_prismatic else math.sin(step)) for basis in bases])
     columns = (ahead - behind).reshape(len(flat), len(bases), 3) / lengths[:, None]
     return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))

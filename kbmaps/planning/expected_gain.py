@@ -133,11 +133,11 @@ def candidate_motions(
     if not (1 <= together <= d and count >= 1):
         raise SettingError(f"together must be from 1 to {d} and count at least 1, got {together} and {count}")
     like = np.clip(_resampled(poses, count, rng), low, high)
-    anywhere = rng.uniform(low, high, (count, d))
-    found = {SAME: like, ALL: anywhere}
+    everywhere = rng.uniform(low, high, (count, d))
+    found = {SAME: like, ALL: everywhere}
     for joints in combinations(range(d), together):
         moved = like.copy()
-        moved[:, joints] = anywhere[:, joints]
+        moved[:, joints] = everywhere[:, joints]
         found[" and ".join(called[k] for k in joints)] = moved
     return found
 

@@ -168,24 +168,24 @@ class GroupedModel:
     def select(self, candidates: tuple[str, ...]) -> None:
         """Add groups while the evidence gains by more than their price, then drop those that are not needed."""
         self.settle()
-        refused: set[str] = set()
+        rejected: set[str] = set()
         while True:
             posterior = self.posterior()
             gains = {
                 g: self._gain(g, self.variances, posterior)
                 for g in candidates
-                if g not in self.variances and g not in refused
+                if g not in self.variances and g not in rejected
             }
             best = max(gains, key=lambda g: gains[g][0], default=None)
             if best is None or gains[best][0] < GroupSettings.price_nats:
                 break
             self._try(best, gains[best][1])
-            refused.add(best)
+            rejected.add(best)
         self.prune()
 
     def prune(self) -> None:
         """Drop groups that the evidence does not need, the least needed first."""
-        while self._leave_the_least_needed():
+        while self._drop_least_needed():
             self.settle()
 
     def average(self, candidates: Sequence[str]) -> Average:
@@ -272,7 +272,7 @@ class GroupedModel:
             errors[-1] -= 2.0 * float(mean @ block.product[index])
         return np.array(errors)
 
-    def _leave_the_least_needed(self) -> bool:
+    def _drop_least_needed(self) -> bool:
         if not self.variances:
             return False
         whole = self.posterior().log_evidence

@@ -225,9 +225,9 @@ class ResidualFeatures:
         points = frames[:, :, :3, 3]
         if self.scaling.load is not None:
             last = chain.fixed[-1]
-            beside = last[:3, :3].T @ (self.scaling.load - last[:3, 3])
+            moment_arms = last[:3, :3].T @ (self.scaling.load - last[:3, 3])
             points = points.copy()
-            points[:, -1] += frames[:, -1, :3, :3] @ beside
+            points[:, -1] += frames[:, -1, :3, :3] @ moment_arms
         return frames, self._places(points)
 
     def _torques(self, group: str, frames: FloatArray, places: FloatArray) -> FloatArray:

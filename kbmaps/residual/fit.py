@@ -103,7 +103,7 @@ class _Fitter:
         self._least_noise = 1.0 if pairs.known else RobustSettings.rounding_m / float(pairs.unit.min())
         self._on_path = self._features.follow_a_path(pairs.q)
         self._present = np.concatenate([change, *prior.weights.values()])
-        self._fresh: dict[str, FloatArray] = {}
+        self._added: dict[str, FloatArray] = {}
         self.variances: dict[str, float] = {}
         self.noise, self.used, self.shared = math.inf, 0.0, 0.0
         self.inliers = np.ones(len(pairs), dtype=np.bool_)
@@ -115,8 +115,8 @@ class _Fitter:
         self.change = self._present[:size]
         self.chain = self._parameters.chain(self.change)
         self.weights: dict[str, FloatArray] = {}
-        for group in dict.fromkeys((*self._known, *self._fresh)):
-            self.weights[group] = self._fresh.get(group, np.zeros(self._features.size(group)))
+        for group in dict.fromkeys((*self._known, *self._added)):
+            self.weights[group] = self._added.get(group, np.zeros(self._features.size(group)))
         start = size
         for group in self._known:
             end = start + self._features.size(group)
@@ -125,7 +125,7 @@ class _Fitter:
 
     def step(self, select: bool) -> float:
         """Step to the most probable weights; return the change of predictions over their uncertainty."""
-        groups = self._considered() if select else tuple(self.variances)
+        groups = self._candidate_groups() if select else tuple(self.variances)
         model = self._model(groups, select)
         model.variances = dict(self.variances)
         if select:
@@ -136,7 +136,7 @@ class _Fitter:
         posterior = model.posterior()
         self.used = sum(posterior.used.values())
         parts = [np.zeros(len(self._free))]
-        parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in model.variances]
+        parts += [self._added.get(g, np.zeros(self._features.size(g))) for g in model.variances]
         step = posterior.mean - np.concatenate(parts)
         moved = model.square_of(step) / model.noise**2
         self.variances, self.noise = dict(model.variances), model.noise
@@ -145,7 +145,7 @@ class _Fitter:
 
     def average(self) -> Average:
         """Take the last step: to the mean over all probable sets of groups."""
-        groups = self._considered()
+        groups = self._candidate_groups()
         model = self._model(groups, ask_correlation=True)
         model.variances = dict(self.variances)
         average = model.average(() if self._on_path else groups)
@@ -157,21 +157,21 @@ class _Fitter:
         """Groups of the prior and of the most probable set."""
         return tuple(dict.fromkeys((*self._known, *self.variances)))
 
-    def _considered(self) -> tuple[str, ...]:
+    def _candidate_groups(self) -> tuple[str, ...]:
         """Return groups with no more features than coordinates; the largest only if the previous one is active."""
         coordinates = 3 * int(self.inliers.sum())
         if self._on_path and coordinates < _Settings.fewest_on_path:
             return tuple(self.variances)
         largest, before = SMOOTH_GROUPS[2], SMOOTH_GROUPS[1]
 
-        def asked(group: str) -> bool:
+        def is_candidate(group: str) -> bool:
             if group in self.variances:
                 return True
             return self._features.size(group) <= coordinates and (group != largest or before in self.variances)
 
-        return tuple(group for group in self._features.groups() if asked(group))
+        return tuple(group for group in self._features.groups() if is_candidate(group))
 
-    def _judge_pairs(self, residuals: FloatArray) -> None:
+    def _select_inliers(self, residuals: FloatArray) -> None:
         """Select inliers by the larger of the middle residual and the noise of the last round."""
         norms = np.linalg.norm(residuals, axis=1)
         typical = max(float(np.median(norms)) / MEDIAN_NORM, self._least_noise)
@@ -184,7 +184,7 @@ class _Fitter:
         """Return the linear model around the current weights; those of the group "" are steps, the others' whole."""
         x = self._features.positions(self.chain, self.weights, self._pairs.q)
         residuals = self._pairs.whitened(self._pairs.x - x) / self._pairs.unit[:, None]
-        self._judge_pairs(residuals)
+        self._select_inliers(residuals)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
             parts = min(
@@ -202,15 +202,15 @@ class _Fitter:
         sizes = [len(self._free), *(self._features.size(group) for group in groups)]
         ends = np.cumsum([0, *sizes]).tolist()
         spans = itertools.starmap(slice, itertools.pairwise(ends))
-        away = (self._prior.mean - self._present)[self._free]
-        seen = 0.0 if self._pairs.known else self._prior.noise / self._unit
+        offset = (self._prior.mean - self._present)[self._free]
+        prior_noise = 0.0 if self._pairs.known else self._prior.noise / self._unit
         return GroupedModel(
             Moments.total(sums),
             dict(zip(("", *groups), spans, strict=True)),
-            cast(FloatArray, np.linalg.solve(self._root, away)),
+            cast(FloatArray, np.linalg.solve(self._root, offset)),
             least_noise=self._least_noise,
             noise=self.noise,
-            noise_before=(seen, _Settings.noise_rows if seen > 0.0 else 0.0),
+            noise_before=(prior_noise, _Settings.noise_rows if prior_noise > 0.0 else 0.0),
             blocks=blocks,
         )
 
@@ -239,21 +239,21 @@ class _Fitter:
         needed = tuple(dict.fromkeys((*groups, *self._known)))
         point = self._features.linearised(self.change, self.chain, self.weights, self._pairs.q[run], needed)
         target = self._pairs.x[run] - point.x
-        for group, weights in self._fresh.items():
+        for group, weights in self._added.items():
             target += point.groups[group] @ weights
         known = np.concatenate([point.chain, *(point.groups[group] for group in self._known)], axis=2)
         design = np.concatenate(
             [known[:, :, self._free] @ self._root, *(point.groups[group] for group in groups)], axis=2
         )
-        some = self._pairs.chosen(run)
-        return some.whitened(design) / some.unit[:, None, None], some.whitened(target) / some.unit[:, None]
+        pairs = self._pairs.chosen(run)
+        return pairs.whitened(design) / pairs.unit[:, None, None], pairs.whitened(target) / pairs.unit[:, None]
 
     def _take(self, mean: FloatArray, groups: Sequence[str]) -> None:
         start = len(self._free)
         self._present[self._free] += self._root @ mean[:start]
-        self._fresh = {}
+        self._added = {}
         for group in groups:
-            self._fresh[group] = mean[start : start + self._features.size(group)]
+            self._added[group] = mean[start : start + self._features.size(group)]
             start += self._features.size(group)
         self._unfold()
 
@@ -265,7 +265,7 @@ class _Fitter:
         # The prior's groups come first, in its order.
         root[self._free] = self._root @ spread[: len(self._free)]
         start = len(self._free)
-        for group, weights in self._fresh.items():
+        for group, weights in self._added.items():
             begin, end = places[group]
             root[begin:end] += spread[start : start + len(weights)]
             start += len(weights)
@@ -286,7 +286,7 @@ def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> Resi
     freedom = max(3.0 * float(fitter.inliers.sum()) - fitter.used, 0.0)
     return ResidualFit(
         model=fitter.model(average.spread),
-        noise=_beyond_chance(fitter.noise, freedom) if pairs.known else fitter.noise,
+        noise=_given_unless_exceeded(fitter.noise, freedom) if pairs.known else fitter.noise,
         freedom=freedom,
         shared=fitter.shared,
         inliers=fitter.inliers,
@@ -301,7 +301,7 @@ def _moments(design: FloatArray, target: FloatArray, correlation: float) -> Mome
     )
 
 
-def _beyond_chance(noise: float, freedom: float) -> float:
+def _given_unless_exceeded(noise: float, freedom: float) -> float:
     """Return the given noise, 1, unless the residuals are larger than chance explains."""
     explained = freedom + _Settings.misfit_sigmas * math.sqrt(2.0 * freedom)
     return 1.0 if noise**2 * freedom <= explained else noise

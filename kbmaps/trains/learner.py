@@ -321,7 +321,7 @@ class TensorLearner(Model):
         known, std = information(data, prior, fit)
         self._posterior = TensorPosterior(self._train, prior, known, noise=fit.noise)
         used = self._q[fit.used]
-        self._posterior.judge(used, self._x[fit.used] - self.predict(used), std)
+        self._posterior.set_residuals(used, self._x[fit.used] - self.predict(used), std)
 
     @property
     def posterior(self) -> TensorPosterior:

@@ -122,12 +122,12 @@ class TensorPosterior:
         self.noise = noise
         self._sizes = misfit_sizes(prior.joints)
         size = CORE_NUMBERS * prior.joints
-        self._left: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._pending_residuals: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._learnt: FloatArray | None = None
         self._widest = widest(np.empty((0, 3)))
         self._misfit, self._absorbed = np.zeros(len(self._sizes)), np.zeros((size, sum(self._sizes)))
 
-    def judge(self, q: FloatArray, residuals: FloatArray, std: FloatArray) -> None:
+    def set_residuals(self, q: FloatArray, residuals: FloatArray, std: FloatArray) -> None:
         """Set the residuals from which errors that the train does not follow are estimated, on demand.
 
         Args:
@@ -135,18 +135,18 @@ class TensorPosterior:
             residuals: residuals (n, 3) [m] of these pairs.
             std: standard deviation of a coordinate of each (n,) [m], as in `information`.
         """
-        self._left, self._learnt = (q, residuals, std), q
+        self._pending_residuals, self._learnt = (q, residuals, std), q
 
     @property
     def misfit(self) -> FloatArray:
         """Standard deviations (3,) [rad, m] of errors that no train follows; 0 if the pairs support none."""
-        self._judge_what_is_left()
+        self._estimate_misfit()
         return self._misfit
 
     @property
     def absorbed(self) -> FloatArray:
         """Part of such errors that the cores absorb (36 d, 5 d + 18)."""
-        self._judge_what_is_left()
+        self._estimate_misfit()
         return self._absorbed
 
     @property
@@ -156,10 +156,10 @@ class TensorPosterior:
             self._widest, self._learnt = widest(self.variance(self._learnt)), None
         return self._widest
 
-    def _judge_what_is_left(self) -> None:
-        if self._left is None:
+    def _estimate_misfit(self) -> None:
+        if self._pending_residuals is None:
             return
-        q, residuals, std = self._left
+        q, residuals, std = self._pending_residuals
         scale = np.repeat(std, 3)[:, None]
         directions = misfit_directions(self._train, q).reshape(len(scale), -1) / scale
         absorbed = (self._linear_roots(q).reshape(len(scale), -1) / scale).T @ directions
@@ -172,7 +172,7 @@ class TensorPosterior:
             misfit: standard deviations (3,) [rad, m].
             absorbed: part of the errors that the cores absorb (36 d, 5 d + 18).
         """
-        self._misfit, self._absorbed, self._left = misfit, absorbed, None
+        self._misfit, self._absorbed, self._pending_residuals = misfit, absorbed, None
 
     def restore(self, misfit: FloatArray, absorbed: FloatArray, widest: float) -> None:
         """Restore `misfit`, `absorbed` and `widest` of a stored posterior."""

@@ -64,10 +64,10 @@ class Pairs:
     def chosen(self, mask: BoolArray) -> Pairs:
         return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
 
-    def problem(self, prior: CorePrior, noise: float, trust: FloatArray | None = None) -> TensorProblem:
-        """Return the problem with `noise` [m] for pairs without a sigma, and variances divided by `trust` (n,)."""
+    def problem(self, prior: CorePrior, noise: float, factors: FloatArray | None = None) -> TensorProblem:
+        """Return the problem with `noise` [m] for pairs without a sigma, and variances divided by `factors` (n,)."""
         std = np.where(self.unknown, noise, self.sigma)
-        return TensorProblem(self.weights, self.x, std if trust is None else std / np.sqrt(trust), prior)
+        return TensorProblem(self.weights, self.x, std if factors is None else std / np.sqrt(factors), prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +85,14 @@ def refine(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float, *, robus
     everything = np.ones(len(pairs.x), dtype=np.bool_)
     if not robust:
         return replace(plain, used=everything)
-    good = _good(pairs, prior, plain)
+    good = _inlier_mask(pairs, prior, plain)
     if good.all():
         return replace(plain, used=everything)
     fit = _reweighted(pairs, prior, plain)
-    good = _good(pairs, prior, fit)
+    good = _inlier_mask(pairs, prior, fit)
     for _ in range(10):
         fit = _settle(pairs.chosen(good), prior, fit.z, fit.noise)
-        now = _good(pairs, prior, fit)
+        now = _inlier_mask(pairs, prior, fit)
         if (now == good).all():
             break
         good = now
@@ -112,16 +112,16 @@ def search(
 
     Ends early if one explains the pairs, or two agree.
     """
-    some = pairs
+    sample = pairs
     if len(pairs.x) > SearchSettings.search_pairs * len(bases):
         mask = np.zeros(len(pairs.x), dtype=np.bool_)
         mask[rng.permutation(len(pairs.x))[: SearchSettings.search_pairs * len(bases)]] = True
-        some = pairs.chosen(mask)
-    best = _from_a_random_chain(some, prior, bases, rng)
+        sample = pairs.chosen(mask)
+    best = _fit_from_random_chain(sample, prior, bases, rng)
     for _ in range(starts - 1):
         if best.noise < SearchSettings.explained * pairs.size:
             break
-        fit = _from_a_random_chain(some, prior, bases, rng)
+        fit = _fit_from_random_chain(sample, prior, bases, rng)
         plausible = best.noise < SearchSettings.plausible * pairs.size
         agrees = plausible and abs(fit.noise / best.noise - 1.0) < SearchSettings.same_noise
         best = min(best, fit, key=lambda candidate: candidate.noise)
@@ -130,19 +130,21 @@ def search(
     return refine(pairs, prior, best.z, best.noise, robust=robust)
 
 
-def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator) -> Fit:
+def _fit_from_random_chain(
+    pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator
+) -> Fit:
     noise = SearchSettings.first_noise * pairs.size
     chain = random_chain(bases, pairs.size / math.sqrt(len(bases)), rng)
     # A small given sigma would make the objective of the first steps rugged.
     problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
     z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), SearchSettings.sweeps)
     z, _ = LevenbergMarquardt().run(problem, z, SearchSettings.first_steps)
-    left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
-    if left > SearchSettings.plausible * pairs.size:
+    rms = math.sqrt(float(np.square(problem.residuals(z)).mean()))
+    if rms > SearchSettings.plausible * pairs.size:
         # Most failed starts are evident by now; converging them would take longer than the next start.
-        return Fit(z, left, np.ones(len(pairs.x), dtype=np.bool_))
-    blind = Pairs(pairs.weights, pairs.x, np.full(len(pairs.x), np.nan))
-    return _settle(blind, prior, z, noise)
+        return Fit(z, rms, np.ones(len(pairs.x), dtype=np.bool_))
+    unweighted = Pairs(pairs.weights, pairs.x, np.full(len(pairs.x), np.nan))
+    return _settle(unweighted, prior, z, noise)
 
 
 def random_chain(bases: Sequence[JointBasis], length: float, rng: np.random.Generator) -> RigidChain:
@@ -224,10 +226,10 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     return lengths / max(unit, least), freedom >= SearchSettings.least_freedom and not rounding
 
 
-def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
+def _inlier_mask(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
     """Return True for each pair (n,) whose distance from the fit is within the noise."""
-    lengths, telling = _distances(pairs, prior, fit)
-    return lengths <= SearchSettings.outlier_distance if telling else np.ones(len(lengths), dtype=np.bool_)
+    lengths, is_meaningful = _distances(pairs, prior, fit)
+    return lengths <= SearchSettings.outlier_distance if is_meaningful else np.ones(len(lengths), dtype=np.bool_)
 
 
 def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
@@ -236,8 +238,8 @@ def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
     z = fit.z
     for _ in range(SearchSettings.rounds):
         lengths, _ = _distances(pairs, prior, replace(fit, z=z))
-        trust = 1.0 / np.square(1.0 + np.square(lengths / SearchSettings.weight_scale))
-        problem = pairs.problem(prior, fit.noise, trust)
+        factors = 1.0 / np.square(1.0 + np.square(lengths / SearchSettings.weight_scale))
+        problem = pairs.problem(prior, fit.noise, factors)
         z, _ = optimiser.run(problem, z, SearchSettings.round_steps)
         moved = float(np.abs(_distances(pairs, prior, replace(fit, z=z))[0] - lengths).max())
         if optimiser.converged and moved < SearchSettings.same_lengths:

@@ -31,39 +31,39 @@ class OutlierGate:
 
     def __init__(self, joints: int) -> None:
         self._memory = PairMemory(joints, OutlierSettings.change_pairs)
-        self.in_a_row = 0
+        self.consecutive = 0
 
     @property
     def changed(self) -> bool:
         """True if the run of outliers is long enough to prove a change."""
-        return self.in_a_row >= OutlierSettings.change_pairs
+        return self.consecutive >= OutlierSettings.change_pairs
 
     @property
-    def perhaps_changed(self) -> bool:
+    def possibly_changed(self) -> bool:
         """True if the run of outliers is long enough for a change, provided that one explanation fits them."""
-        return self.in_a_row >= OutlierSettings.explained_change_pairs
+        return self.consecutive >= OutlierSettings.explained_change_pairs
 
-    def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
+    def classify(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
         """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
-        doubted = distance_m > limit_m
-        self.in_a_row = self.in_a_row + 1 if doubted else 0
-        if doubted:
+        is_outlier = distance_m > limit_m
+        self.consecutive = self.consecutive + 1 if is_outlier else 0
+        if is_outlier:
             self._memory.append(q[None], x[None])
         else:
             self._memory.clear()
-        return doubted
+        return is_outlier
 
     def run(self) -> tuple[FloatArray, FloatArray]:
         """Return the newest consecutive outliers, at most the number that proves a change: q (n, d), x (n, 3)."""
         return self._memory.all()
 
-    def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
-        """Resume from the run q (n, d), x (n, 3) of `in_a_row` consecutive outliers."""
-        self._memory.restore(q, x, in_a_row)
-        self.in_a_row = in_a_row
+    def restore(self, q: FloatArray, x: FloatArray, consecutive: int) -> None:
+        """Resume from the run q (n, d), x (n, 3) of `consecutive` consecutive outliers."""
+        self._memory.restore(q, x, consecutive)
+        self.consecutive = consecutive
 
 
-def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
+def inlier_mask(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
     """Return the mask (n,) of those of a few pairs that fit the others, by distances [m] from a robust fit.
 
     Args:
@@ -75,7 +75,7 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
     return np.asarray(distances_m <= OutlierSettings.times_farther * expected_m)
 
 
-def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
+def is_explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
     """Return True if reducing a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m] is enough."""
     before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
     return after <= min(OutlierSettings.explained_multiple * expected_m, before / OutlierSettings.times_farther)

@@ -69,10 +69,10 @@ class OrientationSolver:
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
         """Add pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN for a pair without one."""
-        told = np.isfinite(turns).all(axis=1)
-        self._pairs += int(told.sum())
-        self._q, self._x = np.vstack([self._q, q[told]]), np.vstack([self._x, x[told]])
-        self._turns = np.vstack([self._turns, turns[told]])
+        has_orientation = np.isfinite(turns).all(axis=1)
+        self._pairs += int(has_orientation.sum())
+        self._q, self._x = np.vstack([self._q, q[has_orientation]]), np.vstack([self._x, x[has_orientation]])
+        self._turns = np.vstack([self._turns, turns[has_orientation]])
         if self._exact is not None:
             self._feed(self._exact)
         kept = BatchSettings.kept

@@ -13,7 +13,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
 from bodyschema.learning.solvers.orientation import BatchSettings, OrientationSolution, OrientationSolver
-from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
+from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, select_tolerances
 from kbmaps import (
     ChainBelief,
     ChainTolerances,
@@ -36,11 +36,11 @@ log = logging.getLogger(__name__)
 
 class SolverSettings:
     retune: float = 1.25  # growth of the number of pairs before the next search for the prior's precision
-    fitted: int = 2000  # number of pairs that a chain is fitted to, evenly spread
+    max_fitted_pairs: int = 2000  # number of pairs that a chain is fitted to, evenly spread
     # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
     first_growth: float = 1.5
     first_share: float = 0.75
-    fewest_first: int = 5
+    min_first_pairs: int = 5
     shared: float = 1.5  # minimum number of neighbours counting as one at which their correlation is not chance
     growth: float = 0.1  # while pairs are few, a solution is cheap, and renewed after this growth of their number
     # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s
@@ -48,7 +48,7 @@ class SolverSettings:
 
 
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
-FOLDED = SolverSettings.fitted
+FOLDED = SolverSettings.max_fitted_pairs
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,8 @@ class DirectSolver:
         self._q, self._x = np.vstack([self._q, q]), np.vstack([self._x, x])
         self._cov = np.concatenate([self._cov, np.full((len(q), 3, 3), np.nan) if cov is None else cov])
         while len(self._q) > BatchSettings.kept:
-            oldest, before = self._first(FOLDED), self._residual_before
-            self._folded = fitted_belief(self._before, *oldest)
+            oldest, before = self._first_pairs(FOLDED), self._residual_prior
+            self._folded = fitted_belief(self._chain_prior, *oldest)
             self._folded_residual = fitted_residual(before, *oldest) or before
             self._q, self._x, self._cov = self._q[FOLDED:], self._x[FOLDED:], self._cov[FOLDED:]
 
@@ -151,13 +151,13 @@ class DirectSolver:
             raise RuntimeError("start a task first")
         task = self._task
         if self._pairs >= SolverSettings.first_growth * self._solved_at:
-            yield from self._solved_of_some(task)
+            yield from self._solve_first_pairs(task)
         self._solved_at = self._pairs
-        wide = fitted_belief(self._before, self._q, self._x, self._cov)
-        made = _ways_made(wide, task, self._q)
+        wide = fitted_belief(self._chain_prior, self._q, self._x, self._cov)
+        candidates = _tolerance_candidates(wide, task, self._q)
         residual_due = self._pairs >= BatchSettings.growth * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
-        rigid = _solved_chain(task, self._pairs, wide, made)
+        rigid = _chain_solution(task, self._pairs, wide, candidates)
         yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
         if self._exact is not None:
             if not task.prior_stays and isinstance(rigid.model, KBMap):
@@ -165,21 +165,23 @@ class DirectSolver:
             yield self._solve_exact(task, self._exact, last=not residual_due and turns is None)
         if residual_due:
             self._residual_at = self._pairs
-            before = self._residual_before
-            before = _as_made(before, task, made) if isinstance(before, ChainBelief) else before
+            before = self._residual_prior
+            before = _with_tolerances(before, task, candidates) if isinstance(before, ChainBelief) else before
             residual = fitted_residual(before, self._q, self._x, self._cov)
             name = RESIDUAL if residual else ""
             yield Solved(task.number, self._pairs, name, residual, residual, last=turns is None)
         if turns is not None and isinstance(rigid.belief, ChainBelief):
             yield Solved(task.number, self._pairs, orientation=turns.solve(rigid.belief))
 
-    def _solved_of_some(self, task: Task) -> Iterator[Solved]:
+    def _solve_first_pairs(self, task: Task) -> Iterator[Solved]:
         """Yield the chain fitted to the first pairs only, so that the remaining pairs can test it."""
-        some = int(len(self._q) * SolverSettings.first_share)
-        if some >= SolverSettings.fewest_first:
-            wide = fitted_belief(self._before, *self._first(some))
-            pairs = self._pairs - len(self._q) + some
-            yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task, self._q[:some])), last=False)
+        count = int(len(self._q) * SolverSettings.first_share)
+        if count >= SolverSettings.min_first_pairs:
+            wide = fitted_belief(self._chain_prior, *self._first_pairs(count))
+            pairs = self._pairs - len(self._q) + count
+            yield replace(
+                _chain_solution(task, pairs, wide, _tolerance_candidates(wide, task, self._q[:count])), last=False
+            )
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Solve least squares around the rigid chain.
@@ -189,7 +191,7 @@ class DirectSolver:
         """
         retune = self._precision is None or learner.pairs >= SolverSettings.retune * self._tuned_at
         try:
-            solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
+            solution = learner.solve(self._choose_precision(learner.prior) if retune else self._precision)
         except SettingError:
             # The precision was lost in rounding: without a solution, the other models keep answering.
             self._precision = None
@@ -198,39 +200,39 @@ class DirectSolver:
             self._precision, self._tuned_at = solution.prior_precision or None, learner.pairs
         return Solved(task.number, learner.pairs, EXACT, solution.map, last=last)
 
-    def _sought_precision(self, prior: KBMap) -> float | Literal["evidence"]:
+    def _choose_precision(self, prior: KBMap) -> float | Literal["evidence"]:
         return blockwise_precision(prior, self._q, self._x) if follow_a_path(prior, self._q) else "evidence"
 
-    def _first(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _first_pairs(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self._q[:count], self._x[:count], self._cov[:count]
 
     @property
-    def _before(self) -> ChainBelief:
+    def _chain_prior(self) -> ChainBelief:
         """Posterior of the chain before the kept pairs."""
         if self._folded is None:
             raise RuntimeError("start a task first")
         return self._folded
 
     @property
-    def _residual_before(self) -> ChainBelief | ResidualModel:
+    def _residual_prior(self) -> ChainBelief | ResidualModel:
         """Posterior of the arm before the kept pairs."""
         if self._folded_residual is None:
             raise RuntimeError("start a task first")
         return self._folded_residual
 
 
-def _ways_made(wide: ChainBelief, task: Task, q: FloatArray) -> list[Tolerances]:
-    return [] if task.tolerances is None else workmanship(wide, task.tolerances, q)
+def _tolerance_candidates(wide: ChainBelief, task: Task, q: FloatArray) -> list[Tolerances]:
+    return [] if task.tolerances is None else select_tolerances(wide, task.tolerances, q)
 
 
-def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Tolerances]) -> Solved:
-    belief = _as_made(wide, task, made)
+def _chain_solution(task: Task, pairs: int, wide: ChainBelief, candidates: Sequence[Tolerances]) -> Solved:
+    belief = _with_tolerances(wide, task, candidates)
     return Solved(task.number, pairs, RIGID, belief.chain.to_kbmap(task.prior.bases), belief, wide=wide)
 
 
-def _as_made(belief: ChainBelief, task: Task, made: Sequence[Tolerances]) -> ChainBelief:
+def _with_tolerances(belief: ChainBelief, task: Task, candidates: Sequence[Tolerances]) -> ChainBelief:
     """Return the posterior of a chain averaged over these tolerances; unchanged if there are none."""
-    return belief if task.tolerances is None or not made else best_tolerances(belief, task.tolerances, made)
+    return belief if task.tolerances is None or not candidates else best_tolerances(belief, task.tolerances, candidates)
 
 
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatArray | None = None) -> ChainBelief:
@@ -244,7 +246,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatAr
         x: positions (n, 3) [m].
         cov: their covariances (n, 3, 3) [m²], NaN for a pair without one; None if no pair has any.
     """
-    chosen = evenly_spread(len(q), SolverSettings.fitted)
+    chosen = evenly_spread(len(q), SolverSettings.max_fitted_pairs)
     q, x = q[chosen], x[chosen]
     learner = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     learner.learn(q, x)
@@ -254,13 +256,13 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatAr
     shared = shared_by(data.whitened(x - learner.predict(q))[inliers])
     if shared < SolverSettings.shared:
         return learner.belief
-    again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
+    reweighted = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     noise = learner.scatter.noise * math.sqrt(shared)
     if data.shape is None:
-        again.learn(q[inliers], x[inliers], noise)
+        reweighted.learn(q[inliers], x[inliers], noise)
     else:
-        again.learn(q[inliers], x[inliers], cov=noise**2 * np.linalg.inv(data.shape.mT @ data.shape)[inliers])
-    return replace(again.belief, noise=learner.belief.noise)
+        reweighted.learn(q[inliers], x[inliers], cov=noise**2 * np.linalg.inv(data.shape.mT @ data.shape)[inliers])
+    return replace(reweighted.belief, noise=learner.belief.noise)
 
 
 def fitted_residual(
@@ -270,7 +272,7 @@ def fitted_residual(
 
     None if it was lost in rounding: the other models keep answering.
     """
-    chosen = evenly_spread(len(q), SolverSettings.fitted)
+    chosen = evenly_spread(len(q), SolverSettings.max_fitted_pairs)
     parameters = prior.parameters if isinstance(prior, ChainBelief) else prior.features.parameters
     learner = ResidualLearner(parameters.reference, ChainTolerances(), prior)
     learner.learn(q[chosen], x[chosen])
@@ -295,14 +297,14 @@ class SolverClient:
     """
 
     def __init__(self, solver: Solver, solve_every: int) -> None:
-        self._solver, self._every = solver, solve_every
+        self._solver, self._solve_every = solver, solve_every
         self.restart()
 
     @property
     def due(self) -> bool:
         """True if it is time to ask."""
-        enough = min(self._every, max(SolverSettings.growth * self._solved_at, 1.0))
-        return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
+        enough = min(self._solve_every, max(SolverSettings.growth * self._solved_at, 1.0))
+        return self.fed > 0 and (self._solve_soon or self.fed - self._solved_at >= enough)
 
     def works_on(self, task: int) -> bool:
         """Return True if it has pairs of this task, and of no later one."""
@@ -316,11 +318,11 @@ class SolverClient:
         """Reset after the solver has lost everything."""
         self._task: int | None = None
         self.fed = self._solved_at = 0
-        self.busy = self._soon = False
+        self.busy = self._solve_soon = False
 
     def solve_soon(self) -> None:
         """Request a solution although fewer pairs than usual are new."""
-        self._soon = self._soon or self.fed > self._solved_at or self._task is None
+        self._solve_soon = self._solve_soon or self.fed > self._solved_at or self._task is None
 
     def begin(self, task: Task) -> bool:
         """Start a new task on the solver; return False if it already has this one."""
@@ -338,9 +340,9 @@ class SolverClient:
         self._solver.learn(q, x, cov, turns)
         self.fed = fed
 
-    def ask(self) -> None:
+    def request_solution(self) -> None:
         self._solver.solve()
-        self.busy, self._soon, self._solved_at = True, False, self.fed
+        self.busy, self._solve_soon, self._solved_at = True, False, self.fed
 
     def poll(self) -> Solved | None:
         """Return the next answer if there is one, without waiting."""

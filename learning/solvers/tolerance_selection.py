@@ -17,7 +17,7 @@ from kbmaps.robust import RobustSettings
 
 class ToleranceSettings:
     # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
-    workmanship = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
+    select_tolerances = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
     compared_pairs = 100  # pairs at which candidates are compared with the posterior, evenly spread
     least_share = 0.01  # less probable tolerances are not considered
     # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
@@ -32,7 +32,7 @@ class Tolerances:
     share: float  # their probability
 
 
-def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray) -> list[Tolerances]:
+def select_tolerances(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray) -> list[Tolerances]:
     """Return the probable tolerances of the arm, from the evidence of its pairs.
 
     MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. If the nominal chain is
@@ -48,16 +48,16 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray)
         The probable candidates, the narrowest last.
     """
     q = q[evenly_spread(len(q), ToleranceSettings.compared_pairs)]
-    order = reversed(ToleranceSettings.workmanship)
-    candidates = [tolerances, *(each for made in order for each in _narrower(tolerances, *made))]
+    order = reversed(ToleranceSettings.select_tolerances)
+    candidates = [tolerances, *(each for selected in order for each in _narrower(tolerances, *selected))]
     narrowed = [belief.tightened(tolerances, each) for each in candidates]
-    lost = _lost_in_the_curve(belief, [found for found, _ in narrowed], q)
-    kept, shares = probable(np.array([evidence for _, evidence in narrowed]) - lost)
-    made = {int(k): Tolerances(candidates[k], float(share)) for k, share in zip(kept, shares, strict=True)}
-    return [made[k] for k in sorted(made)]
+    losses = _nonlinearity_loss(belief, [found for found, _ in narrowed], q)
+    kept, shares = probable_indices(np.array([evidence for _, evidence in narrowed]) - losses)
+    selected = {int(k): Tolerances(candidates[k], float(share)) for k, share in zip(kept, shares, strict=True)}
+    return [selected[k] for k in sorted(selected)]
 
 
-def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: FloatArray) -> FloatArray:
+def _nonlinearity_loss(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: FloatArray) -> FloatArray:
     """Return the evidence [nats] that narrower posteriors (m,) lose because positions are nonlinear in the parameters.
 
     A narrower prior moves the undetermined parameters along a tangent. If the pairs are precise, the positions at the
@@ -72,15 +72,15 @@ def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: 
     def square(columns: FloatArray) -> float:
         return float(np.square(np.linalg.solve(roots, columns)).sum(axis=2).mean())
 
-    grown = list[float]()
+    growths = list[float]()
     for each in narrowed:
-        there, turned = each.parameters.linearised(each.mean, q)
-        apart = there - x - jacobian @ (each.mean - belief.mean)
-        grown.append(square(apart[..., None]) + square(turned @ each.root) - square(jacobian @ each.root))
-    return 0.5 * belief.root.any(axis=1).sum() * np.maximum(grown, 0.0)
+        x_there, jacobian_there = each.parameters.linearised(each.mean, q)
+        curvature = x_there - x - jacobian @ (each.mean - belief.mean)
+        growths.append(square(curvature[..., None]) + square(jacobian_there @ each.root) - square(jacobian @ each.root))
+    return 0.5 * belief.root.any(axis=1).sum() * np.maximum(growths, 0.0)
 
 
-def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+def probable_indices(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
     """Return the indices of the probable explanations, the most probable first, and their probabilities.
 
     Args:
@@ -92,7 +92,7 @@ def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
     return kept, shares[kept] / shares[kept].sum()
 
 
-def best_tolerances(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[Tolerances]) -> ChainBelief:
+def best_tolerances(belief: ChainBelief, tolerances: ChainTolerances, candidates: Sequence[Tolerances]) -> ChainBelief:
     """Return the chain nearest to nominal that is not improbable, with the uncertainty of all candidates.
 
     Its covariance covers all candidate tolerances. If these explain the pairs equally well, they differ only away from
@@ -101,12 +101,12 @@ def best_tolerances(belief: ChainBelief, tolerances: ChainTolerances, made: Sequ
     Args:
         belief: posterior for an arm of the widest tolerances.
         tolerances: the widest tolerances.
-        made: the candidates.
+        candidates: the candidates.
     """
-    beliefs = [belief.tightened(tolerances, each.tolerances)[0] for each in made]
-    likely = max(each.share for each in made)
-    best = max(k for k, each in enumerate(made) if each.share > ToleranceSettings.likely * likely)
-    return beliefs[best].among(beliefs, [each.share for each in made])
+    beliefs = [belief.tightened(tolerances, each.tolerances)[0] for each in candidates]
+    likely = max(each.share for each in candidates)
+    best = max(k for k, each in enumerate(candidates) if each.share > ToleranceSettings.likely * likely)
+    return beliefs[best].with_mixture_covariance(beliefs, [each.share for each in candidates])
 
 
 def _narrower(tolerances: ChainTolerances, angle: float, length: float) -> list[ChainTolerances]:

@@ -53,7 +53,7 @@ class Damage:
         """Number of lost pairs."""
         return sum(last - first + 1 for first, last in self.ranges)
 
-    def told(self, file: Path) -> str:
+    def sentence(self, file: Path) -> str:
         """Return a sentence with the numbers and the remedy."""
         one = self.count == 1
         many, they = ("1 pair", "It is") if one else (f"{self.count} pairs", "They are")
@@ -167,7 +167,7 @@ def records(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any, .
     try:
         last = store_schema.CHECKSUM if with_checksums else "NULL"
         statement = f"SELECT {COLUMNS[table]}, {last} FROM {table} ORDER BY id LIMIT ?"
-        for row in connection.execute(statement, (_most_rows(connection),)):
+        for row in connection.execute(statement, (_max_rows(connection),)):
             try:
                 if with_checksums:
                     require_sound(row)
@@ -215,28 +215,30 @@ def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[st
     columns = store_schema.columns(schema)
     store_schema.create(target, contents)
     with store_schema.transaction(target):
-        target.executemany(store_schema.INSERT["pairs"], map(_written, scan(source, columns, make)))
-        bad, behind = 0, None
+        target.executemany(store_schema.INSERT["pairs"], map(_resealed, scan(source, columns, make)))
+        bad, bad_at_end = 0, None
         try:
             for row in scan_back(source, columns, make):
                 if row is None:
                     bad += 1
                     continue
-                behind = bad if behind is None else behind
-                target.execute(store_schema.INSERT["pairs"], _written(row))
-            behind = bad if behind is None else behind
+                bad_at_end = bad if bad_at_end is None else bad_at_end
+                target.execute(store_schema.INSERT["pairs"], _resealed(row))
+            bad_at_end = bad if bad_at_end is None else bad_at_end
         except sqlite3.DatabaseError as error:
             if not is_damage(error):
                 raise
         for table in ("sessions", "devices"):
             sound = (row for row in records(source, table) if row is not None)
-            target.executemany(store_schema.INSERT[table], map(_written, sound))
+            target.executemany(store_schema.INSERT[table], map(_resealed, sound))
         newest = target.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
-        given = max(store_schema.given_up_to(contents), newest + (_Settings.left_free if behind is None else behind))
-        store_schema.write_meta(target, {**contents, store_schema.GIVEN_UP_TO: str(given)})
+        used_up_to = max(
+            store_schema.given_up_to(contents), newest + (_Settings.left_free if bad_at_end is None else bad_at_end)
+        )
+        store_schema.write_meta(target, {**contents, store_schema.GIVEN_UP_TO: str(used_up_to)})
 
 
-def _written(row: tuple[Any, ...]) -> tuple[Any, ...]:
+def _resealed(row: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return the sealed row, with bytes decoded to text."""
     return sealed(tuple(value.decode(errors="replace") if isinstance(value, bytes) else value for value in row))
 
@@ -246,22 +248,22 @@ def _rows(connection: sqlite3.Connection, statement: str, start: int) -> Iterato
 
     Python's sqlite3 does not return the row before an unreadable one, so that row is requested again as the last one.
     """
-    came = 0
+    count = 0
     try:
-        with closing(connection.execute(statement, (start, _most_rows(connection)))) as rows:
+        with closing(connection.execute(statement, (start, _max_rows(connection)))) as rows:
             for row in rows:
-                came += 1
+                count += 1
                 yield row
         return
     except sqlite3.DatabaseError as error:
         if not is_damage(error):
             raise
-        met = error
-    with contextlib.suppress(sqlite3.DatabaseError), closing(connection.execute(statement, (start, came + 1))) as rows:
-        yield from islice(rows, came, None)
-    raise met
+        failure = error
+    with contextlib.suppress(sqlite3.DatabaseError), closing(connection.execute(statement, (start, count + 1))) as rows:
+        yield from islice(rows, count, None)
+    raise failure
 
 
-def _most_rows(connection: sqlite3.Connection) -> int:
+def _max_rows(connection: sqlite3.Connection) -> int:
     pages, size = (connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
     return pages * size // _Settings.smallest_row_bytes

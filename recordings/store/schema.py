@@ -127,9 +127,9 @@ def check_kind(connection: sqlite3.Connection, file: Path) -> None:
             f"{file} was written by a newer bodyschema (schema {found}, this one knows {SCHEMA_VERSION}). "
             f"Install the newer bodyschema, or give another --state-dir. {NOTHING_CHANGED}"
         )
-    odd = _unlike(connection, found)
-    if odd is not None:
-        raise StoreError(damaged(file, odd))
+    mismatch = _schema_mismatch(connection, found)
+    if mismatch is not None:
+        raise StoreError(damaged(file, mismatch))
 
 
 def version(connection: sqlite3.Connection) -> int:
@@ -233,7 +233,7 @@ def _pair_columns(schema: int) -> list[str]:
     return [*turned, CHECKSUM] if schema >= WITH_CHECKSUMS else turned
 
 
-def _unlike(connection: sqlite3.Connection, schema: int) -> str | None:
+def _schema_mismatch(connection: sqlite3.Connection, schema: int) -> str | None:
     """Return a difference between the file and a pair store of this schema; None if there is none."""
     if connection.execute("PRAGMA encoding").fetchone()[0] != b"UTF-8":
         return "its texts are not UTF-8"
@@ -245,8 +245,8 @@ def _unlike(connection: sqlite3.Connection, schema: int) -> str | None:
         for statement in statements_of(schema):
             sound.execute(statement)
         expected, there = _tables(sound), _tables(connection)
-    odd = next((table for table, columns in expected.items() if there.get(table) != columns), None)
-    return None if odd is None else f"its table {odd.decode()} is not that of schema {schema}"
+    mismatch = next((table for table, columns in expected.items() if there.get(table) != columns), None)
+    return None if mismatch is None else f"its table {mismatch.decode()} is not that of schema {schema}"
 
 
 def _tables(connection: sqlite3.Connection) -> dict[bytes, list[tuple[object, ...]]]:

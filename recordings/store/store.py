@@ -297,9 +297,9 @@ class PairStore:
     @property
     def complaints(self) -> list[str]:
         """Problems with the file, in sentences; from any thread."""
-        said = [] if self._rebuilt is None else [self._rebuilt]
+        messages = [] if self._rebuilt is None else [self._rebuilt]
         damage = self.reader.present_damage()
-        return [*said, damage.told(self.file)] if damage.count else said
+        return [*messages, damage.sentence(self.file)] if damage.count else messages
 
     def __enter__(self) -> Self:
         try:
@@ -338,10 +338,10 @@ class PairStore:
             # An entry without pairs carries no information.
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
             number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM devices").fetchone()[0]
-            told = (number, self._session_id, self._seq + 1, utc, as_json(record))
-            connection.execute(store_schema.INSERT["devices"], sealed(told))
+            row = (number, self._session_id, self._seq + 1, utc, as_json(record))
+            connection.execute(store_schema.INSERT["devices"], sealed(row))
 
-    def go_on_with(self, session: Session) -> None:
+    def switch_session(self, session: Session) -> None:
         """Use this session from the next pair on; raise StoreError if the disk is full or broken."""
         connection = self._require_open()
         self._session = session
@@ -417,9 +417,9 @@ class PairStore:
         if read >= 0 and lost > 1:
             contents = store_schema.meta(connection)
             newest = connection.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
-            given = max(newest + lost, store_schema.given_up_to(contents))
+            used_up_to = max(newest + lost, store_schema.given_up_to(contents))
             with store_schema.transaction(connection):
-                store_schema.write_meta(connection, {**contents, store_schema.GIVEN_UP_TO: str(given)})
+                store_schema.write_meta(connection, {**contents, store_schema.GIVEN_UP_TO: str(used_up_to)})
 
     def _rebuild(self, what: str) -> None:
         """Continue with a new file that contains everything readable."""
@@ -458,8 +458,8 @@ class PairStore:
             # Repeated restarts of a sampler that sees no pair must not fill the disk.
             connection.execute("DELETE FROM sessions WHERE id > ?", (self._newest_session,))
             number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM sessions").fetchone()[0]
-            told = (session.started_utc, session.robot_toml, session.urdf, session.config, session.version)
-            connection.execute(store_schema.INSERT["sessions"], sealed((number, *told, session.host)))
+            contents = (session.started_utc, session.robot_toml, session.urdf, session.config, session.version)
+            connection.execute(store_schema.INSERT["sessions"], sealed((number, *contents, session.host)))
         self._session_id = number
 
     def _check_joints(self, stored: tuple[str, ...]) -> None:

@@ -39,7 +39,7 @@ class _Settings:
     noise_fields: int = 8
     noise_shift_px: int = 64
     # Portraits: radius of the marker [px], and how far a tag is turned away [deg]. Several, as chance may spoil one.
-    portraits = ((40.0, 30.0), (60.0, 40.0), (30.0, 10.0), (60.0, 20.0))
+    ball_portraits = ((40.0, 30.0), (60.0, 40.0), (30.0, 10.0), (60.0, 20.0))
 
 
 def cast_ball(
@@ -186,7 +186,7 @@ def _is_black(place: FloatArray, black: np.ndarray) -> np.ndarray:
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
 
 
-class StereoEyes:
+class StereoRenderer:
     """Painter of stereo frames.
 
     Args:
@@ -315,16 +315,16 @@ class StereoEyes:
         cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)
 
 
-def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ...]]:
+def ball_portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ...]]:
     """Yield the marker alone in front of a plain wall in each eye's image (height, width, 3), BGR, without noise.
 
     The marker is centred between the images and near enough to be measured well; a tag is turned a little away.
     """
-    eyes = StereoEyes(EmptyWorld(), calibration, msgspec.structs.replace(config, clutter=0, noise=0.0), seed=0)
+    eyes = StereoRenderer(EmptyWorld(), calibration, msgspec.structs.replace(config, clutter=0, noise=0.0), seed=0)
     width, height = calibration.image_size_px
     middle_px = np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px
     faced = rotation_of(np.array(config.tags[0].rpy)).T if config.tags else np.eye(3)
-    for radius_px, turn_deg in _Settings.portraits:
+    for radius_px, turn_deg in _Settings.ball_portraits:
         # Limit the size so that the marker stays inside both images.
         z = calibration.focal_px * max(config.marker_radius_m / radius_px, 2.0 * calibration.baseline_m / width)
         x, y = middle_px * z / calibration.focal_px

@@ -33,7 +33,7 @@ class RenderProcess:
     """
 
     def __init__(self, urdf: PhysicsUrdf, truth: TrueRobot, calibration: StereoCalibration, config: SimConfig) -> None:
-        calibration = truth.true_eyes(calibration)
+        calibration = truth.true_calibration(calibration)
         self._setup = Setup(
             urdf=urdf,
             joints=truth.robot.joints,

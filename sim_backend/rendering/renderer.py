@@ -20,12 +20,12 @@ from bodyschema.sim_backend.geometry import turn_of_z
 from bodyschema.sim_backend.physics_urdf import UrdfSettings
 from kbmaps.rotations import quaternions
 
-from .eye import TO_LIGHT, StereoEyes
+from .eye import TO_LIGHT, StereoRenderer
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
 
 
-class Stick:
+class ToolStick:
     """The tool: a thin, massless rod from the hand to the ball, visible but without collisions."""
 
     def __init__(self, body: Body, link: str) -> None:
@@ -76,8 +76,8 @@ def serve(memory: int, requests: int, answers: int) -> None:
     calibration = setup.calibration
     with Body(setup.urdf, setup.joints) as body, mmap.mmap(memory, SLOTS * frame_bytes(setup)) as shared:
         raster = Raster(body.bullet, body.client, calibration, TO_LIGHT)
-        eyes = StereoEyes(raster, calibration, setup.camera, setup.seed)
-        stick = Stick(body, setup.marker_link)
+        eyes = StereoRenderer(raster, calibration, setup.camera, setup.seed)
+        stick = ToolStick(body, setup.marker_link)
         while (message := _next(pipe)) is not None:
             if isinstance(message, Tool):
                 stick.change(np.array(message.tip))
@@ -86,7 +86,7 @@ def serve(memory: int, requests: int, answers: int) -> None:
                 os.write(answers, b"\0")
 
 
-def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tuple[ImageArray, ...]) -> None:
+def _paint(frame: Frame, body: Body, stick: ToolStick, eyes: StereoRenderer, images: tuple[ImageArray, ...]) -> None:
     body.set_angles(np.array(frame.angles))
     stick.follow()
     T_world_camera, x_eyes = np.array(frame.T_world_camera).reshape(4, 4), np.array(frame.x_eyes).reshape(-1, 3)

@@ -113,7 +113,7 @@ class Scene:
         excluded = {effect.key for effect in (*but, *others)}
         ranked = self._nearest(target, others, [e for e in hypotheses(self.simulation) if e.key not in excluded])
         tried = [self.fitted(target, [*others, effect]) for _, effect in ranked[:NEAREST]]
-        possible = [fit for fit in tried if fit.effects[-1].is_possible]
+        possible = [fit for fit in tried if fit.effects[-1].is_valid]
         return sorted(possible, key=lambda fit: fit.chi2)
 
     def _nearest(

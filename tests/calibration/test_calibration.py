@@ -42,7 +42,7 @@ from bodyschema.sim_backend.physics import Physics
 from bodyschema.sim_backend.truth import TrueRobot
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rig_file import write_rig
-from bodyschema.vision.rig.stereo_rig import Made, StereoRig
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, StereoRig
 from kbmaps import ChainParameters, ChainTolerances
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
@@ -327,7 +327,7 @@ def test_output_states_whether_intervals_include_camera_calibration(pairs_file, 
     assert "The intervals leave out how well the cameras are calibrated" in said
     assert "cameras.toml: there is no such file" in said
     lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
-    made = Made("", "", 20, 0, 0.0, 0.0, 0.0)
+    made = CalibrationProvenance("", "", 20, 0, 0.0, 0.0, 0.0)
     rig = StereoRig(lens, lens, np.zeros(3), np.array([-0.1, 0.0, 0.0]), (640, 480), ("", ""), 1e-8 * np.eye(24), made)
     write_rig(rig, robot.with_name("cameras.toml"))
     called(pairs_file)

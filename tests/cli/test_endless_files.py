@@ -24,7 +24,7 @@ from bodyschema.recordings.store.store import PairReader
 from bodyschema.robot.limited import UnfitFile, read_at_most
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.robot.urdf import UrdfTree
-from bodyschema.vision.cameras.film import read_times
+from bodyschema.vision.cameras.recorded_eyes import read_times
 from bodyschema.vision.image_file import read_image
 
 JOINTS = ("waist", "shoulder")

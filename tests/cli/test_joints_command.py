@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.hardware.joints_watch import JointState, JointsWatch, Seen, SignCheck, Speeds, screen, signs_in
+from bodyschema.cli.hardware.joints_watch import ArmState, JointState, JointsWatch, SignCheck, Speeds, screen, signs_in
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_joints
@@ -41,7 +41,7 @@ def signs(config: Config, *path: tuple[int, float], begin=(0.0, 0.0, 0.5, 0.0)) 
         for _ in range(30):
             t += 0.05
             check.take(t, q)
-    return check.said
+    return check.prediction
 
 
 def test_raised_arm_is_reported_in_urdf_direction(config) -> None:
@@ -94,7 +94,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path, p
             look_until(watch, lambda seen: True)
             for shoulder[0] in np.linspace(0.2, 0.6, 20):
                 look_until(watch, lambda seen: abs(seen.joints[PITCH].angle - shoulder[0]) < 0.01)
-            watch.know_temperatures()
+            watch.read_temperatures()
             seen = look_until(watch, lambda seen: True)
         assert bench.arm.count > 20
     pitch = seen.joints[PITCH]
@@ -104,7 +104,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path, p
     assert seen.moved.startswith("shoulder_pitch +")
 
 
-def look_until(watch: JointsWatch, done) -> Seen:
+def look_until(watch: JointsWatch, done) -> ArmState:
     for _ in range(1000):
         seen = watch.look()
         if seen is not None and done(seen):
@@ -148,7 +148,7 @@ def shown(signs_in: str = "direction = -1", **changes) -> str:
     state |= {"low": 0.0, "high": 0.6, "lower": -1.0, "upper": 1.0, "within_limits": True} | changes
     console = Console(file=StringIO(), width=80)
     console.print(
-        screen(Seen((JointState(**state),), "elbow +20°: by the URDF the marker went up", (), None, signs_in))
+        screen(ArmState((JointState(**state),), "elbow +20°: by the URDF the marker went up", (), None, signs_in))
     )
     assert isinstance(console.file, StringIO)
     return console.file.getvalue()

@@ -31,11 +31,11 @@ def seen(folder: Path, every: int) -> Sources:
 
 def test_often_missed_marker_is_reported_with_reason(tmp_path) -> None:
     found = collected(seen(tmp_path, 2), 5.0, lambda _: None)
-    assert found.said == "the marker was found in 20 of 40 images: 20 at border"
+    assert found.summary == "the marker was found in 20 of 40 images: 20 at border"
 
 
 def test_found_marker_causes_no_complaint(tmp_path) -> None:
-    assert collected(seen(tmp_path, 1), 5.0, lambda _: None).said == ""
+    assert collected(seen(tmp_path, 1), 5.0, lambda _: None).summary == ""
 
 
 def test_never_found_marker_error_names_the_reasons(tmp_path) -> None:

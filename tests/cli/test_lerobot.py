@@ -261,10 +261,16 @@ def test_a_second_recording_is_noted_beside_the_first(tmp_path) -> None:
     for file in files[:2]:
         corrected.write(file)
     corrected.write(tmp_path)  # a folder is not noted
-    assert [bool(corrected.already(file)) for file in (*files, tmp_path, None)] == [True, True, False, False, False]
-    assert "follower.json.before2" in corrected.already(files[1])[0]
+    assert [bool(corrected.already_written(file)) for file in (*files, tmp_path, None)] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+    assert "follower.json.before2" in corrected.already_written(files[1])[0]
     (tmp_path / "first.csv-wal").write_text("later pairs of a store")
-    assert corrected.already(files[0]) == []
+    assert corrected.already_written(files[0]) == []
 
 
 def test_calibrations_of_old_lerobot_are_refused(tmp_path) -> None:

@@ -88,8 +88,8 @@ def unfitted(found: Gathered, serials: tuple[str, str], tell: Callable[[str], No
     return Mock(spec=Calibrated)
 
 
-def live(eyes: PluggedEyes, views: LiveViews, made=fitted, show=lambda _: None, **given) -> LiveCalibration:
-    return LiveCalibration(eyes, views, made, show, SystemClock(), **given)
+def live(eyes: PluggedEyes, views: LiveViews, provenance=fitted, show=lambda _: None, **given) -> LiveCalibration:
+    return LiveCalibration(eyes, views, provenance, show, SystemClock(), **given)
 
 
 def test_it_ends_by_itself_when_nothing_is_missing(views) -> None:
@@ -137,7 +137,7 @@ def test_stopping_calibrates_from_the_views_so_far(views) -> None:
 
     calibration = live(eyes, seen, show=show)
     found, result = calibration.run()
-    assert (len(found.views), result.rig.made.views) == (10, 10)
+    assert (len(found.views), result.rig.provenance.views) == (10, 10)
 
 
 def test_stopping_too_early_names_missing_views(views) -> None:
@@ -168,11 +168,11 @@ def test_different_cameras_plugged_in_midway_are_refused(views, impatient) -> No
     eyes = PluggedEyes([*frames[:8], SourceLost("unplugged"), *frames[8:]], [RIGHT, ("A1", "C3"), RIGHT])
     told: list[tuple[str, str]] = []
 
-    def made(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None]) -> Calibrated:
+    def provenance(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None]) -> Calibrated:
         told.append(serials)
         return unfitted(found, serials, tell)
 
-    found, _ = live(eyes, seen, made, shown.append).run()
+    found, _ = live(eyes, seen, provenance, shown.append).run()
     assert (len(found.views), eyes.opened, told) == (10, 3, [RIGHT])
     assert any("A1 and C3 with 640x480 pixels, the views are of A1 and B2" in "".join(each.trouble) for each in shown)
 
@@ -293,7 +293,7 @@ def test_the_robots_own_cameras_are_calibrated_and_checked(robot, capsys) -> Non
     assert abs(rig.baseline_m - truth.baseline_m) < 2.5 * rig.baseline_sigma_m
     assert 'In [vision.cameras] write\ncalibration = "cameras.toml"' in said.out
     assert "Next: tilt the board's" in said.err
-    assert len(list((robot.parent / "views").glob("left*.png"))) == rig.made.views + rig.made.left_out
+    assert len(list((robot.parent / "views").glob("left*.png"))) == rig.provenance.views + rig.provenance.left_out
     called("calibrate", "cameras", "--check", "--robot", robot, "--json")
     assert msgspec.json.decode(capsys.readouterr().out, type=CheckFile).holds
 

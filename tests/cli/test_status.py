@@ -15,7 +15,7 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.cli.main import app
-from bodyschema.cli.terminal.status_view import Seen, Watcher, as_json, screen
+from bodyschema.cli.terminal.status_view import ProcessStates, Watcher, as_json, screen
 from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
@@ -34,7 +34,7 @@ def config(tmp_path: Path, free_endpoint) -> Config:
     return Config.load(write_small_arm(tmp_path, tables), {})
 
 
-def shown(seen: Seen, config: Config) -> str:
+def shown(seen: ProcessStates, config: Config) -> str:
     console = Console(file=io.StringIO(), width=80)
     console.print(screen(seen, ClientConfig.load(config.file, {})))
     return console.file.getvalue()
@@ -87,35 +87,35 @@ def sampler_running(config: Config) -> Iterator[None]:
     ],
 )
 def test_the_screen_shows_both_processes(config, said) -> None:
-    assert said in " ".join(shown(Seen(SAMPLER, LEARNER), config).split())
+    assert said in " ".join(shown(ProcessStates(SAMPLER, LEARNER), config).split())
 
 
 def test_one_segment_is_not_said_to_be_several(config) -> None:
-    assert "612 in 1 segment, " in shown(Seen(msgspec.structs.replace(SAMPLER, segment=1), None), config)
+    assert "612 in 1 segment, " in shown(ProcessStates(msgspec.structs.replace(SAMPLER, segment=1), None), config)
 
 
 def test_user_reported_tool_change_is_shown_as_reported(config) -> None:
     change = msgspec.structs.replace(
         LEARNER.last_change, found=False, kind="tool", earliest_seq=601, latest_seq=601, moved_m=None
     )
-    text = " ".join(shown(Seen(None, msgspec.structs.replace(LEARNER, last_change=change)), config).split())
+    text = " ".join(shown(ProcessStates(None, msgspec.structs.replace(LEARNER, last_change=change)), config).split())
     assert "change tool at pair 601 (told); 12 pairs since" in text
 
 
 def test_rolled_back_change_is_not_in_force(config) -> None:
     learner = msgspec.structs.replace(LEARNER, changes=2, last_change=None, pairs_since_change=600)
     assert "change none in force of 2 reported or detected; 600 pairs count" in " ".join(
-        shown(Seen(None, learner), config).split()
+        shown(ProcessStates(None, learner), config).split()
     )
 
 
 def test_silent_process_is_named_with_its_start_command(config) -> None:
-    text = " ".join(shown(Seen(SAMPLER, None), config).split())
+    text = " ".join(shown(ProcessStates(SAMPLER, None), config).split())
     assert f"learner does not answer on {config.tables.zenoh.learner}. Start it with `bodyschema run learner`" in text
 
 
 def test_json_has_null_for_a_missing_process() -> None:
-    seen = json.loads(as_json(Seen(SAMPLER, None)))
+    seen = json.loads(as_json(ProcessStates(SAMPLER, None)))
     assert (seen["sampler"]["pairs"], seen["learner"]) == (612, None)
 
 

@@ -14,7 +14,7 @@ from shown_board import known_rig
 from small_arm import write_small_arm
 
 from bodyschema.cli.cameras.watching import MjpegServer, _Settings
-from bodyschema.cli.hardware.robot_template import EXAMPLE, Seen, robot_toml
+from bodyschema.cli.hardware.robot_template import EXAMPLE, CameraFindings, robot_toml
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.cameras import camera_checks
@@ -205,7 +205,7 @@ def test_doctor_opens_the_configured_images(tmp_path) -> None:
 
 
 def test_two_plugged_in_cameras_become_robot_eyes() -> None:
-    text = robot_toml(EXAMPLE, Seen(["/dev/v4l/by-id/a", "/dev/v4l/by-id/b"]))
+    text = robot_toml(EXAMPLE, CameraFindings(["/dev/v4l/by-id/a", "/dev/v4l/by-id/b"]))
     assert 'left = "/dev/v4l/by-id/a"\nright = "/dev/v4l/by-id/b"\n' in text
 
 

@@ -69,7 +69,7 @@ from bodyschema.vision.cameras.v4l2.device import OpenCapture
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rectified import RectifiedCamera
-from bodyschema.vision.rig.stereo_rig import Made, StereoRig
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, StereoRig
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.trackers import tracker_of
 
@@ -216,7 +216,7 @@ def rig_of(camera: StereoCamera) -> StereoRig:
     true = camera.calibration
     lens = Lens("pinhole", (true.focal_px, true.focal_px), true.principal_point_px, (0.0,) * 5)
     place = np.array([-true.baseline_m, 0.0, 0.0])
-    made = Made("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
+    made = CalibrationProvenance("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
     return StereoRig(lens, lens, np.zeros(3), place, true.image_size_px, Unrectified.serials, np.eye(24), made)
 
 

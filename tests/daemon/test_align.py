@@ -56,10 +56,10 @@ def test_readings_too_far_apart_are_stale(buffer) -> None:
 
 
 @pytest.mark.parametrize(("t_sigma", "slack"), [(0.0, 0.0), (0.002, 0.02)])
-def test_slack_is_speed_times_time_sigma(buffer, t_sigma, slack) -> None:
+def test_slack_is_speed_times_time_sigma(buffer, t_sigma, time_uncertainty_motion) -> None:
     buffer.put(JointReading(0.0, frozen_array([0.0, 1.0]), t_sigma))
     buffer.put(JointReading(0.01, frozen_array([0.1, 1.0])))
-    assert buffer.slack(0.005).tolist() == pytest.approx([slack, 0.0])
+    assert buffer.time_uncertainty_motion(0.005).tolist() == pytest.approx([time_uncertainty_motion, 0.0])
 
 
 def test_a_frame_before_all_readings_has_no_joints(buffer) -> None:
@@ -98,12 +98,12 @@ def test_a_frame_waits_for_the_reading_after_it(buffer) -> None:
 
 def test_lost_encoders_keep_no_frame_waiting(buffer) -> None:
     buffer.put(reading(1.0, 1.0, 1.0))
-    buffer.silence()
+    buffer.expect_no_readings()
     assert buffer.at(1.05, 3600.0) is Reason.NO_JOINTS
 
 
 def test_the_first_reading_ends_the_silence(buffer) -> None:
-    buffer.silence()
+    buffer.expect_no_readings()
     buffer.put(reading(1.0, 1.0, 1.0))
     with ThreadPoolExecutor() as pool, waited_on(buffer) as begun:
         waiting = pool.submit(buffer.at, 1.05, LIMIT_S)

@@ -12,11 +12,11 @@ import pytest
 from guided_arm import Scene, new_learning, teach
 
 from bodyschema.daemon.learner.checkpoint import (
-    LARGEST_BYTES,
+    MAX_BYTES,
     CheckpointError,
     generations,
-    go_on,
     read_checkpoint,
+    resume_from_checkpoint,
     set_aside,
     write_checkpoint,
 )
@@ -99,9 +99,9 @@ def test_previous_checkpoint_is_kept_without_hard_links(written, old, new, monke
 
 @pytest.mark.parametrize("name", ["net_nlms", "q", "x"])
 def test_non_finite_state_is_not_written(written, old, new, name) -> None:
-    poisoned = {**new.arrays, name: np.full_like(new.arrays[name], np.nan)}
+    invalid_array = {**new.arrays, name: np.full_like(new.arrays[name], np.nan)}
     with pytest.raises(CheckpointError, match=f"was not written: {name} is not finite"):
-        write(written, LearningState(new.header, poisoned))
+        write(written, LearningState(new.header, invalid_array))
     assert same(old, read_checkpoint(written, robot="arm"))
 
 
@@ -216,7 +216,7 @@ def test_impossible_kept_pairs_are_refused(written, old, name, number) -> None:
     arrays = {**old.arrays, name: np.full_like(old.arrays[name], number)}
     data = b"".join(np.ascontiguousarray(array, dtype="<f8").tobytes() for array in arrays.values())
     sealed(written, lambda header: None, lambda _: data)
-    learning, said = go_on(new_learning, written, "arm")
+    learning, said = resume_from_checkpoint(new_learning, written, "arm")
     assert learning.counters.pairs == 0
     assert said is not None
     assert f"{name} is not finite or too large" in said
@@ -233,7 +233,7 @@ def test_a_device_as_checkpoint_is_refused(file, endless) -> None:
 def test_a_huge_checkpoint_is_refused_unread(file) -> None:
     file.parent.mkdir()
     with file.open("wb") as stream:
-        stream.truncate(LARGEST_BYTES + 1)
+        stream.truncate(MAX_BYTES + 1)
     with pytest.raises(CheckpointError, match="cannot read the checkpoint"):
         read_checkpoint(file, robot="arm")
 
@@ -264,7 +264,7 @@ def go_on_from_nasty_headers(written: Path, count: int) -> None:
     for _ in range(count):
         written.write_bytes(data)
         sealed(written, lambda header: header.update(altered(header, rng)))
-        learning, _ = go_on(new_learning, written, "arm")
+        learning, _ = resume_from_checkpoint(new_learning, written, "arm")
         assert learning.counters.pairs >= 0
         learning.state()
 

@@ -9,7 +9,7 @@ from small_arm import write_small_arm
 from bodyschema.daemon.sampler.counters import SamplerCounters, _Settings
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import Reason
-from bodyschema.interfaces.rejections import REMEDIES, WORDS, words_of
+from bodyschema.interfaces.rejections import REMEDIES, WORDS, rejection_text
 from bodyschema.robot.description import RobotDescription
 
 Q = np.zeros(2)
@@ -32,7 +32,7 @@ def test_every_reason_has_words_and_a_remedy(reason) -> None:
 
 
 def test_unknown_reason_of_newer_version_is_shown() -> None:
-    assert words_of("too_cold") == "too cold"
+    assert rejection_text("too_cold") == "too cold"
 
 
 @pytest.mark.parametrize("reason", [Reason.NO_MARKER, Reason.EPIPOLAR, Reason.STALE, Reason.MOVING])

@@ -66,7 +66,7 @@ def fill(store: PairStore, count: int) -> None:
 def test_each_session_keeps_device_record_of_its_pairs(file) -> None:
     for _ in range(2):
         with PairStore(file, SESSION) as store:
-            assert not DeviceWatch(Joints(), store, SystemClock()).look()
+            assert not DeviceWatch(Joints(), store, SystemClock()).check()
             fill(store, 3)
     with PairReader(file) as reader:
         kept = reader.devices()
@@ -85,11 +85,11 @@ def test_each_session_keeps_device_record_of_its_pairs(file) -> None:
 )
 def test_device_change_since_last_session_is_reported_once(file, caplog, changes, said) -> None:
     with PairStore(file, SESSION) as store:
-        DeviceWatch(Joints(), store, SystemClock()).look()
+        DeviceWatch(Joints(), store, SystemClock()).check()
         fill(store, 1)
     with PairStore(file, SESSION) as store:
         watch = DeviceWatch(Joints(**changes), store, SystemClock())
-        assert (watch.look(), watch.look()) == (True, False)
+        assert (watch.check(), watch.check()) == (True, False)
     (message,) = caplog.messages
     assert watch.changes == [message]
     assert re.search(said, message)
@@ -99,22 +99,22 @@ def test_device_change_while_running_applies_from_next_pair(file) -> None:
     with PairStore(file, SESSION) as store:
         joints = Joints()
         watch = DeviceWatch(joints, store, SystemClock())
-        watch.look()
+        watch.check()
         fill(store, 3)
         joints.record = (ELBOW | {"homing_offset_ticks": 100},)
-        assert watch.look()
+        assert watch.check()
         fill(store, 1)
         assert [one.from_seq for one in store.reader.devices()] == [1, 4]
 
 
 def test_device_record_without_pairs_is_forgotten(file) -> None:
     with PairStore(file, SESSION) as store:
-        DeviceWatch(Joints(), store, SystemClock()).look()
+        DeviceWatch(Joints(), store, SystemClock()).check()
         fill(store, 1)
     for offset in (100, 0):
         with PairStore(file, SESSION) as store:
             watch = DeviceWatch(Joints(homing_offset_ticks=offset), store, SystemClock())
-            assert watch.look() == bool(offset)
+            assert watch.check() == bool(offset)
 
 
 def test_changed_return_delay_is_not_a_device_change() -> None:
@@ -149,7 +149,7 @@ def test_writing_to_schema_1_store_migrates_its_pairs(file) -> None:
         identity = store.identity
     as_schema_1(file)
     with PairStore(file, SESSION) as store:
-        DeviceWatch(Joints(), store, SystemClock()).look()
+        DeviceWatch(Joints(), store, SystemClock()).check()
         fill(store, 1)
         assert (store.identity, store.reader.last_seq()) == (identity, 3)
         assert [one.from_seq for one in store.reader.devices()] == [3]
@@ -158,7 +158,7 @@ def test_writing_to_schema_1_store_migrates_its_pairs(file) -> None:
 def test_mcap_file_carries_device_record(file, tmp_path) -> None:
     reader = pytest.importorskip("mcap.reader")
     with PairStore(file, SESSION) as store:
-        DeviceWatch(Joints(), store, SystemClock()).look()
+        DeviceWatch(Joints(), store, SystemClock()).check()
         fill(store, 1)
         devices = store.reader.devices()
     recording = Recording(("elbow",), np.zeros((1, 1)), np.zeros((1, 3)), t=np.zeros(1))

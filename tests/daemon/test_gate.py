@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.daemon.config import DaemonConfig
-from bodyschema.daemon.sampler.gate import Gate
+from bodyschema.daemon.sampler.gate import PairGate
 from bodyschema.interfaces.records import Pair, Reason, frozen_array
 
 FRAME_S = 1 / 30
@@ -25,7 +25,7 @@ def at_deg(*degrees: float) -> np.ndarray:
 class Walk:
     """Offers one measurement a frame to a gate and keeps the verdicts."""
 
-    def __init__(self, gate: Gate, t: float = 100.0) -> None:
+    def __init__(self, gate: PairGate, t: float = 100.0) -> None:
         self.gate, self.t = gate, t
 
     def offer(self, *degrees: float, x: np.ndarray = HERE, after_s: float = FRAME_S) -> int | Reason:
@@ -35,7 +35,7 @@ class Walk:
 
 @pytest.fixture
 def walk() -> Walk:
-    return Walk(Gate(DaemonConfig(), TWO_REVOLUTE))
+    return Walk(PairGate(DaemonConfig(), TWO_REVOLUTE))
 
 
 def test_first_measurement_starts_segment_one(walk) -> None:
@@ -44,14 +44,14 @@ def test_first_measurement_starts_segment_one(walk) -> None:
 
 @given(step=st.floats(1.001, 2.999), direction=st.floats(0, 2 * np.pi))
 def test_step_of_one_to_three_degrees_continues_segment(step, direction) -> None:
-    walk = Walk(Gate(DaemonConfig(), TWO_REVOLUTE))
+    walk = Walk(PairGate(DaemonConfig(), TWO_REVOLUTE))
     walk.offer(10, 20)
     assert walk.offer(10 + step * np.cos(direction), 20 + step * np.sin(direction)) == 1
 
 
 @given(step=st.floats(0.0, 0.999), direction=st.floats(0, 2 * np.pi))
 def test_a_smaller_step_has_to_wait(step, direction) -> None:
-    walk = Walk(Gate(DaemonConfig(), TWO_REVOLUTE))
+    walk = Walk(PairGate(DaemonConfig(), TWO_REVOLUTE))
     walk.offer(10, 20)
     assert walk.offer(10 + step * np.cos(direction), 20 + step * np.sin(direction)) is Reason.TOO_NEAR
 
@@ -90,12 +90,12 @@ def test_resting_arm_gives_no_further_pair(walk) -> None:
 
 def test_restart_continues_from_last_pair_in_new_segment() -> None:
     last = Pair("store", 7, 4, 1e9, "", frozen_array(at_deg(10, 20)), frozen_array(HERE), frozen_array(np.eye(3)))
-    walk = Walk(Gate(DaemonConfig(), TWO_REVOLUTE, last))
+    walk = Walk(PairGate(DaemonConfig(), TWO_REVOLUTE, last))
     assert [walk.offer(10.5, 20), walk.offer(12, 20), walk.offer(14, 20)] == [Reason.TOO_NEAR, 5, 5]
 
 
 def test_prismatic_step_is_scaled_by_metres_per_degree() -> None:
-    walk = Walk(Gate(DaemonConfig(metres_per_degree=0.01), np.array([True])))
+    walk = Walk(PairGate(DaemonConfig(metres_per_degree=0.01), np.array([True])))
     walk.t += FRAME_S
     walk.gate.offer(walk.t, np.array([0.5]), HERE)
     verdicts = [walk.gate.offer(walk.t + FRAME_S * i, np.array([0.5 + 0.009 * i]), HERE) for i in (1, 2)]
@@ -142,6 +142,6 @@ def test_speed_check_uses_last_fix_not_last_pair(walk) -> None:
 
 
 def test_any_step_takes_poses_however_near_or_far() -> None:
-    walk = Walk(Gate(DaemonConfig(any_step=True), TWO_REVOLUTE))
+    walk = Walk(PairGate(DaemonConfig(any_step=True), TWO_REVOLUTE))
     verdicts = [walk.offer(0, 0), walk.offer(0, 0), walk.offer(80, -60, x=moved(0, 2.0, 0)), walk.offer(82, -60)]
     assert verdicts == [1, 1, 2, 2]

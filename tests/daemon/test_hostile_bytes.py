@@ -28,7 +28,7 @@ from bodyschema.cli.servos.log import LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner import checkpoint
 from bodyschema.daemon.learner.answers import Answers
-from bodyschema.daemon.learner.checkpoint import DOES_NOT_FIT, CheckpointError
+from bodyschema.daemon.learner.checkpoint import INVALID_CONTENT_ERRORS, CheckpointError
 from bodyschema.daemon.sampler.history import answer_pairs
 from bodyschema.daemon.transport import wire
 from bodyschema.daemon.transport.session import Request
@@ -434,7 +434,7 @@ def test_a_forged_checkpoint_is_restored_or_refused(tmp_path: Path, stored, plac
     try:
         assert state is not None
         learning.restore(state)
-    except (StateError, KBMapsError, *DOES_NOT_FIT):  # errors for which the learner sets the file aside
+    except (StateError, KBMapsError, *INVALID_CONTENT_ERRORS):  # errors for which the learner sets the file aside
         return
     assert np.isfinite(learning.snapshot.predict(np.zeros((1, len(Scene.draw(0, 1).pairs[0].q)))).x).all()
 

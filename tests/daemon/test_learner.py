@@ -31,7 +31,7 @@ from bodyschema.interfaces.records import Pair
 from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rig_file import write_rig
-from bodyschema.vision.rig.stereo_rig import Made, OneEyeRig
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, OneEyeRig
 
 KEYS = Keys("arm")
 
@@ -142,7 +142,7 @@ image_size_px = [640, 480]
 
 def calibrated(tmp_path: Path, *, k1: float = 0.0) -> None:
     """Write the camera's calibration."""
-    made = Made("", "", 20, 0, 0.0, 0.0, 0.0)
+    made = CalibrationProvenance("", "", 20, 0, 0.0, 0.0, 0.0)
     lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (k1, 0.0, 0.0, 0.0, 0.0))
     write_rig(OneEyeRig(lens, (640, 480), ("",), 1e-12 * np.eye(9), made), tmp_path / "cameras.toml")
 

@@ -18,7 +18,13 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learner.host import Background, alone, attend, run_learners, session_settings
+from bodyschema.daemon.learner.host import (
+    Background,
+    exclusive_state,
+    run_learners,
+    serve_until_stopped,
+    session_settings,
+)
 from bodyschema.daemon.learner.learner import Learner
 from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError
@@ -66,13 +72,13 @@ def asked(endpoint: str, robot: str) -> LearnerStatus:
 
 
 def test_one_process_answers_for_every_robot(robots: list[Config]) -> None:
-    wishes = SignalFlags()
-    host = threading.Thread(target=run_learners, args=(robots, SystemClock(), wishes, Notifier()))
+    signals = SignalFlags()
+    host = threading.Thread(target=run_learners, args=(robots, SystemClock(), signals, Notifier()))
     host.start()
     try:
         said = [asked(robots[0].tables.zenoh.learner, name) for name in ("left", "right")]
     finally:
-        wishes.end()
+        signals.end()
         host.join()
     assert [status.robot for status in said] == ["left", "right"]
     assert all(config.checkpoint_file.exists() for config in robots)
@@ -95,10 +101,10 @@ def test_a_second_learner_on_the_state_is_refused(robots: list[Config], killed: 
         if killed:
             other.kill()
             other.wait()
-            with alone(robots[0]):
+            with exclusive_state(robots[0]):
                 pass
         else:
-            with pytest.raises(StoreError, match=f"another learner is writing {file}"), alone(robots[0]):
+            with pytest.raises(StoreError, match=f"another learner is writing {file}"), exclusive_state(robots[0]):
                 pass
             other.terminate()
 
@@ -106,8 +112,8 @@ def test_a_second_learner_on_the_state_is_refused(robots: list[Config], killed: 
 class Attended:
     """A learner that receives a request while it is served, and whose process ends two rounds later."""
 
-    def __init__(self, wishes: SignalFlags, wishing: bool) -> None:
-        self.wishes, self.wishing, self.rounds, self.reloads = wishes, wishing, 0, 0
+    def __init__(self, signals: SignalFlags, wishing: bool) -> None:
+        self.signals, self.wishing, self.rounds, self.reloads = signals, wishing, 0, 0
 
     def status(self) -> LearnerStatus:
         return LEARNER
@@ -119,16 +125,16 @@ class Attended:
     def tick(self) -> None:
         self.rounds += 1
         if self.wishing and self.rounds == 1:
-            self.wishes.reloading = True
+            self.signals.reloading = True
         if self.rounds == 3:
-            self.wishes.end()
+            self.signals.end()
 
 
 def test_mid_round_reload_reaches_every_robot_once() -> None:
-    wishes, clock = SignalFlags(), SystemClock()
-    learners = [Attended(wishes, wishing) for wishing in (False, True, False)]
+    signals, clock = SignalFlags(), SystemClock()
+    learners = [Attended(signals, wishing) for wishing in (False, True, False)]
     service = Service(Notifier(), (), clock)
-    attend(cast("list[Learner]", learners), [lambda _: None] * 3, wishes, service, [])
+    serve_until_stopped(cast("list[Learner]", learners), [lambda _: None] * 3, signals, service, [])
     assert [learner.reloads for learner in learners] == [1, 1, 1]
 
 
@@ -216,11 +222,11 @@ def pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_solver_orders_wait_while_another_robot_is_solved(shared: SolverPool, process: ScriptedProcess) -> None:
-    first, second = shared.seat(), shared.seat()
-    for seat in (first, second):
-        seat.start(TASK)
-        seat.learn(*pairs(10))
-        seat.solve()
+    first, second = shared.new_solver(), shared.new_solver()
+    for new_solver in (first, second):
+        new_solver.start(TASK)
+        new_solver.learn(*pairs(10))
+        new_solver.solve()
     first.poll()
     assert process.told == [("start", 0), ("learn", 0), ("solve", 0)]
     process.answer = Solved(1, 10, "", None, None, last=True)
@@ -230,13 +236,13 @@ def test_solver_orders_wait_while_another_robot_is_solved(shared: SolverPool, pr
 
 
 def test_robot_with_most_new_pairs_is_solved_next(shared: SolverPool, process: ScriptedProcess) -> None:
-    busy, old, new = (shared.seat() for _ in range(3))
-    for seat, count in ((busy, 10), (old, 10), (new, 10)):
-        seat.learn(*pairs(count))
-        seat.solve()
-        seat.poll()
+    busy, old, new = (shared.new_solver() for _ in range(3))
+    for new_solver, count in ((busy, 10), (old, 10), (new, 10)):
+        new_solver.learn(*pairs(count))
+        new_solver.solve()
+        new_solver.poll()
         process.answer = Solved(1, count, "", None, None, last=True)
-        seat.poll()
+        new_solver.poll()
     busy.solve()
     busy.poll()
     old.learn(*pairs(1))
@@ -249,7 +255,7 @@ def test_robot_with_most_new_pairs_is_solved_next(shared: SolverPool, process: S
 
 
 def test_a_lost_process_leaves_no_order_behind(shared: SolverPool, process: ScriptedProcess) -> None:
-    first, second = shared.seat(), shared.seat()
+    first, second = shared.new_solver(), shared.new_solver()
     second.learn(*pairs(5))
     first.learn(*pairs(5))
     first.solve()
@@ -259,7 +265,7 @@ def test_a_lost_process_leaves_no_order_behind(shared: SolverPool, process: Scri
     with pytest.raises(SolverLostError):
         first.poll()
     process.lost = False
-    assert (second.asked, second.poll()) == (False, None)
+    assert (second.is_requested, second.poll()) == (False, None)
 
 
 # --- work in turns
@@ -288,7 +294,7 @@ class Scripted:
 def test_no_robot_waits_for_another_s_backlog() -> None:
     stop, done = threading.Event(), list[str]()
     workers = [Scripted("busy", 4, done, stop.set), Scripted("quiet", 2, done, stop.set)]
-    background = Background(workers, Service.nobodys(SystemClock()), SystemClock(), stop)
+    background = Background(workers, Service.unsupervised(SystemClock()), SystemClock(), stop)
     thread = threading.Thread(target=background.run)  # its thread becomes a batch thread, for good
     thread.start()
     thread.join()
@@ -302,7 +308,7 @@ def test_background_work_neither_interrupts_others_nor_starves() -> None:
         seen.append((os.sched_getscheduler(threading.get_native_id()), os.getpriority(os.PRIO_PROCESS, 0)))
         stop.set()
 
-    background = Background([Scripted("one", 6, [], end)], Service.nobodys(SystemClock()), SystemClock(), stop)
+    background = Background([Scripted("one", 6, [], end)], Service.unsupervised(SystemClock()), SystemClock(), stop)
     thread = threading.Thread(target=background.run)
     thread.start()
     thread.join()

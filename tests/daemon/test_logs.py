@@ -95,10 +95,10 @@ class Flapping:
     file = Path("pairs.sqlite")
 
     def __init__(self, said: list[Exception | int]) -> None:
-        self._said = iter(said)
+        self._recent = iter(said)
 
     def append(self, *_: object) -> int:
-        found = next(self._said)
+        found = next(self._recent)
         if isinstance(found, Exception):
             raise found
         return found
@@ -185,7 +185,7 @@ def test_number_of_remembered_messages_is_bounded() -> None:
     journal = Journal()
     for k in range(5000):
         journal.say("x" * (k % 1000))
-    assert len(journal.handler._said) <= logs.RepeatSettings.remembered
+    assert len(journal.handler._recent) <= logs.RepeatSettings.remembered
 
 
 def test_a_signal_calls_for_an_orderly_end() -> None:

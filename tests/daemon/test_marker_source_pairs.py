@@ -74,7 +74,9 @@ def test_datagrams_become_pairs_on_the_encoders_clock(tmp_path, endpoint) -> Non
     keys = {"kind": "udp", "port": port, "sigma_m": SIGMA_M, "latency_sigma_s": 0.0}
     clock = SystemClock()
     stream = stream_of(source_tables(keys, Path("robot.toml"), "")[0], clock)
-    sources = Sources(GuidedJoints(), stream, clock, cameras=stream, seen_by="the positions by udp", live=True)
+    sources = Sources(
+        GuidedJoints(), stream, clock, cameras=stream, marker_source_name="the positions by udp", live=True
+    )
     stop = threading.Event()
     sender = threading.Thread(target=send, args=(port, stop))
     sender.start()

@@ -15,7 +15,7 @@ from bodyschema.drivers.markers.fusing import FusedMarkers
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rig_file import write_rig
-from bodyschema.vision.rig.stereo_rig import Made, StereoRig
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, StereoRig
 
 JOINTS = '[drivers.ros2]\nrouter = "tcp/127.0.0.1:7461"\n'
 
@@ -66,7 +66,7 @@ def test_arm_with_a_marker_source_needs_no_cameras(tmp_path) -> None:
     config = load(tmp_path, f'{JOINTS}[marker_source]\nkind = "udp"\n')
     with open_sources(config, sim=False) as sources:
         assert sources.calibration is None
-        assert sources.seen_by == "the positions by udp"
+        assert sources.marker_source_name == "the positions by udp"
 
 
 CAMERAS = """
@@ -91,7 +91,7 @@ image_size_px = [640, 480]
 
 def test_further_cameras_and_mocap_are_fused(tmp_path) -> None:
     lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
-    made = Made("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
+    made = CalibrationProvenance("2026-01-01T00:00:00Z", "none", 1, 0, 0.1, 0.1, 0.0)
     place = np.array([-0.1, 0.0, 0.0])
     write_rig(
         StereoRig(lens, lens, np.zeros(3), place, (640, 480), ("C", "D"), np.eye(24), made), tmp_path / "side.toml"
@@ -99,7 +99,7 @@ def test_further_cameras_and_mocap_are_fused(tmp_path) -> None:
     text = CAMERAS.format(calibration='calibration = "side.toml"') + JOINTS + f'{TWO}kind = "udp"\n'
     config = load(tmp_path, text)
     with open_sources(config, sim=False) as sources:
-        assert sources.seen_by == "the positions by cameras and side and udp"
+        assert sources.marker_source_name == "the positions by cameras and side and udp"
         assert isinstance(sources.marker, FusedMarkers)
         assert [member.name for member in sources.marker.members] == ["cameras", "side", "udp"]
         np.testing.assert_allclose(sources.marker.members[1].pose[:3, 3], [1.0, 0.0, 0.5])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from bodyschema.daemon.transport.query_limiter import EVERYBODYS, LIMITS, Limits, QueryLimiter
+from bodyschema.daemon.transport.query_limiter import LIMITS, TOTAL_RATIO, Limits, QueryLimiter
 from bodyschema.interfaces.errors import RequestError
 
 
@@ -71,7 +71,7 @@ def test_oversized_request_error_names_limit() -> None:
 def test_waiting_bytes_are_limited_per_source_and_overall() -> None:
     limits = Limits(waiting_bytes=100, request_bytes=100)
     desk: QueryLimiter[str] = QueryLimiter(limits, Watch())
-    for name in range(EVERYBODYS):
+    for name in range(TOTAL_RATIO):
         desk.admit(str(name), 100, "full")
     with pytest.raises(RequestError, match="100 bytes of queries of the source 0 wait already, and 100 are the most"):
         desk.admit("0", 1, "more")

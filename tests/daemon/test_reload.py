@@ -34,13 +34,13 @@ def test_a_changed_setting_is_followed_or_told(
     old: str,
     new: str,
     changed: list[str],
-    waiting: list[str],
+    needs_restart: list[str],
     tmp_path: Path,
 ) -> None:
     config = Config.load(write_small_arm(tmp_path, TAG), {})
     config.file.write_text(config.file.read_text().replace(old, new))
     found = reload(config, *process)
-    assert (found.changed, found.waiting) == (changed, waiting)
+    assert (found.changed, found.needs_restart) == (changed, needs_restart)
 
 
 def test_every_table_is_followed_by_a_process() -> None:

@@ -25,7 +25,7 @@ from bodyschema.interfaces.records import frozen_array
 LIMIT_S = 500.0
 
 
-class Powered:
+class PoweredMode:
     """Joints with scripted answers."""
 
     name, state = "zero_force", "off"
@@ -51,14 +51,14 @@ def config(tmp_path, endpoint: str) -> Config:
     )
 
 
-def sources(config: Config, drive: Powered) -> Sources:
+def sources(config: Config, drive: PoweredMode) -> Sources:
     held = threading.Event()
     joints, marker = Scripted([held], config.robot.joints), Scripted([held])
     return Sources(joints, marker, SystemClock(), powered=(drive,))
 
 
 def test_command_returns_the_arm_s_answer(config) -> None:
-    drive = Powered({True: "it floats", False: "it is off"})
+    drive = PoweredMode({True: "it floats", False: "it is off"})
     with running(config, sources(config, drive)) as bus:
         assert command(bus, "zero_force_on") == "it floats"
         assert command(bus, "zero_force_off") == "it is off"
@@ -66,14 +66,14 @@ def test_command_returns_the_arm_s_answer(config) -> None:
 
 
 def test_a_refusal_is_the_answer(config) -> None:
-    drive = Powered({True: RequestError("joint 'elbow' is in operating mode 3")})
+    drive = PoweredMode({True: RequestError("joint 'elbow' is in operating mode 3")})
     with running(config, sources(config, drive)) as bus, pytest.raises(RequestError, match="in operating mode 3"):
         command(bus, "zero_force_on")
 
 
 def test_unanswered_command_is_cancelled_after_timeout(config, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.daemon.sampler.sources.ANSWER_S", 0.05)
-    drive = Powered()
+    drive = PoweredMode()
     with running(config, sources(config, drive)) as bus, pytest.raises(RequestError, match="not read at present"):
         command(bus, "zero_force_on")
     assert drive.asked[0][1].cancelled()
@@ -81,27 +81,27 @@ def test_unanswered_command_is_cancelled_after_timeout(config, monkeypatch) -> N
 
 def test_unconfigured_command_is_refused(config) -> None:
     with (
-        running(config, sources(config, Powered())) as bus,
+        running(config, sources(config, PoweredMode())) as bus,
         pytest.raises(RequestError, match="gaze is not configured"),
     ):
         command(bus, "gaze_on")
 
 
 def test_gaze_command_is_refused_in_simulation(config) -> None:
-    simulated = replace(sources(config, Powered()), simulation=object())
+    simulated = replace(sources(config, PoweredMode()), simulation=object())
     with running(config, simulated) as bus, pytest.raises(RequestError, match="gaze is of a real arm"):
         command(bus, "gaze_on")
 
 
 def test_its_complaints_are_in_the_status(config) -> None:
-    drive = Powered()
+    drive = PoweredMode()
     drive.complaints = ("zero_force ended, torque off: it is too hot",)
     with running(config, sources(config, drive)) as bus:
         status = status_when(bus, lambda status: bool(status.health))
     assert drive.complaints[0] in status.health
 
 
-class Head(Powered):
+class GazeMode(PoweredMode):
     """A head that stands still and records its commands."""
 
     name, head = "gaze", ("neck_yaw", "neck_pitch")
@@ -125,7 +125,7 @@ def test_running_sampler_sends_gaze_angles_within_limits(tmp_path, endpoint) -> 
         "BODYSCHEMA_ZENOH_SAMPLER": endpoint,
         "BODYSCHEMA_DAEMON_STATE_DIR": str(tmp_path),
     }
-    config, head, held = Config.load(demonstration_model(), environment), Head(), threading.Event()
+    config, head, held = Config.load(demonstration_model(), environment), GazeMode(), threading.Event()
     joints, marker = Scripted([held], config.robot.joints), Scripted([held])
     with running(config, Sources(joints, marker, SystemClock(), powered=(head,), head=head)):
         first, _ = head.told.get(timeout=LIMIT_S)
@@ -136,7 +136,7 @@ def test_running_sampler_sends_gaze_angles_within_limits(tmp_path, endpoint) -> 
 
 
 def test_gaze_without_a_stereo_pair_is_refused(config) -> None:
-    head, held = Head(), threading.Event()
+    head, held = GazeMode(), threading.Event()
     joints, marker = Scripted([held], config.robot.joints), Scripted([held])
     with (
         pytest.raises(ConfigError, match="how the cameras see"),
@@ -145,7 +145,7 @@ def test_gaze_without_a_stereo_pair_is_refused(config) -> None:
         pass
 
 
-def walking(config: Config, drive: Powered) -> Sources:
+def walking(config: Config, drive: PoweredMode) -> Sources:
     return replace(Walk(config.robot, 10).sources(), powered=(drive,))
 
 
@@ -156,13 +156,13 @@ def borne(config) -> Config:
 
 
 def test_pairs_are_rejected_without_required_zero_force(borne) -> None:
-    pairs, status = sample(borne, walking(borne, Powered()))
+    pairs, status = sample(borne, walking(borne, PoweredMode()))
     assert (pairs, status.rejected) == ([], {"not_borne": 10})
     assert any("zero_force is to bear the arm" in text for text in status.health)
 
 
 def test_pairs_are_taken_while_zero_force_is_on(borne) -> None:
-    drive = Powered()
+    drive = PoweredMode()
     drive.state = "on"
     assert len(sample(borne, walking(borne, drive))[0]) == 10
 
@@ -174,5 +174,5 @@ class Cameras:
 
 
 def test_camera_warnings_are_in_the_status(config) -> None:
-    with running(config, replace(sources(config, Powered()), cameras=Cameras())) as bus:
+    with running(config, replace(sources(config, PoweredMode()), cameras=Cameras())) as bus:
         assert Cameras.health[0] in status_when(bus, lambda status: bool(status.health)).health

@@ -498,7 +498,7 @@ def test_flood_from_one_client_does_not_starve_others(endpoint: str) -> None:
             target=lambda: answers.put(modest.ask_one(KEYS.predict, b"modest", timeout_s=LIMIT_S))
         )
         asking.start()
-        waiting = server._receptions[0]._sources
+        waiting = server._limiters[0]._sources
         until = time.monotonic() + LIMIT_S
         while len(waiting) < 2 and time.monotonic() < until:
             time.sleep(0.01)

@@ -88,7 +88,7 @@ def test_frequent_loops_feed_watchdog_only_when_needed(service, clock, systemd) 
 
 
 def test_finished_loop_does_not_starve_watchdog(service, clock, systemd) -> None:
-    service.leave("encoders")
+    service.remove_loop("encoders")
     a_round_of(service, clock, "frames")
     assert systemd.all() == ["WATCHDOG=1"]
 
@@ -107,7 +107,7 @@ def test_a_start_that_works_is_given_more_time(systemd, tmp_path) -> None:
 
 
 def test_reload_notifies_start_time_and_ready(service, systemd) -> None:
-    service.follow(lambda: "nothing changed")
+    service.reload_and_report(lambda: "nothing changed")
     first, last = systemd.all()
     assert first.startswith("RELOADING=1\nMONOTONIC_USEC=")
     assert last == "READY=1"
@@ -115,7 +115,7 @@ def test_reload_notifies_start_time_and_ready(service, systemd) -> None:
 
 def test_status_is_one_line_sent_on_change(service, systemd) -> None:
     for line in ("running, 2 pairs", "running, 2 pairs", "the disk\nis full"):
-        service.tell(line)
+        service.report_status(line)
     assert systemd.all() == ["STATUS=running, 2 pairs", "STATUS=the disk is full"]
 
 
@@ -137,7 +137,7 @@ def test_abstract_socket_is_notified(clock) -> None:
 def test_systemd_variables_are_removed_from_environment(tmp_path) -> None:
     environment = {"NOTIFY_SOCKET": "/run/n", "WATCHDOG_USEC": "20000000", "WATCHDOG_PID": str(os.getpid()), "A": "b"}
     notifier = Notifier.of_environment(environment)
-    assert (environment, notifier.watchdog_s, notifier.is_heard) == ({"A": "b"}, 20.0, True)
+    assert (environment, notifier.watchdog_s, notifier.is_connected) == ({"A": "b"}, 20.0, True)
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def test_solver_interval_is_tenth_up_to_configured_limit(
     solver: ScriptedSolver, solving: SolverClient, solved_at: int, not_yet: int, due_at: int
 ) -> None:
     solving.feed(Q, X, solved_at)
-    solving.ask()
+    solving.request_solution()
     solver.answer = Solved(1, solved_at, RIGID, PRIOR)
     solving.poll()
     solving.feed(Q, X, not_yet)
@@ -75,7 +75,7 @@ def test_solver_interval_is_tenth_up_to_configured_limit(
 
 def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
-    solving.ask()
+    solving.request_solution()
     solver.answer = Solved(1, 25, RIGID, PRIOR)
     solving.poll()
     solving.solve_soon()
@@ -84,7 +84,7 @@ def test_no_solution_is_due_without_new_pairs(solver: ScriptedSolver, solving: S
 
 def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
-    solving.ask()
+    solving.request_solution()
     busy = []
     for last in (False, True):
         solver.answer = Solved(1, 25, RIGID, PRIOR, last=last)
@@ -95,7 +95,7 @@ def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: Solve
 
 def test_solver_is_busy_from_request_to_answer(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
-    solving.ask()
+    solving.request_solution()
     waiting = solving.busy, solving.poll(), solving.busy
     solver.answer = Solved(1, 25, RIGID, PRIOR)
     assert solving.poll() is not None

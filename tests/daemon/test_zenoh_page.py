@@ -32,7 +32,7 @@ from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, Joints
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import PairLimits, Reason
-from bodyschema.learning.state import MOST_POINTS
+from bodyschema.learning.state import MAX_CURVE_POINTS
 from bodyschema.recordings.store.store import PairStore
 from bodyschema.robot.hand_eye import MarkerPose
 
@@ -81,7 +81,7 @@ def test_the_page_s_limits_are_the_code_s() -> None:
     limits = section("Limits")
     assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
     assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
-    assert f"| points of the learning curve | {MOST_POINTS} |" in limits
+    assert f"| points of the learning curve | {MAX_CURVE_POINTS} |" in limits
     assert f"| within {PairLimits.farthest_m:.0f} m, else" in limits
 
 
@@ -273,8 +273,8 @@ def sampler_running(config: Config, sources: Sources) -> Iterator[None]:
 def test_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -> None:
     tables = f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'
     config = Config.load(write_small_arm(tmp_path, tables), {})
-    walk, go_on = Walk(config.robot, 40), threading.Event()
-    sources = walk.sources(fixes=[*walk.fixes[:20], go_on, *walk.fixes[20:]])
+    walk, resume_from_checkpoint = Walk(config.robot, 40), threading.Event()
+    sources = walk.sources(fixes=[*walk.fixes[:20], resume_from_checkpoint, *walk.fixes[20:]])
     command = [sys.executable, "-I", str(ROOT / "examples" / "follow_pairs.py"), "arm", endpoint, "3", "40"]
     with (
         sampler_running(config, sources),
@@ -282,7 +282,7 @@ def test_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -> No
     ):
         try:
             lines = [follower.stdout.readline() for _ in range(10)]  # it has started with the stored pairs
-            go_on.set()
+            resume_from_checkpoint.set()
             lines += follower.stdout.readlines()
         finally:
             follower.kill()

@@ -12,7 +12,7 @@ import pytest
 
 from bodyschema.cli.hardware.doctor import zenoh_check
 from bodyschema.daemon.transport.identity import Route
-from bodyschema.daemon.transport.session import Request, ZenohSession, client, unreached
+from bodyschema.daemon.transport.session import Request, ZenohSession, client, unreachable
 from bodyschema.daemon.transport.wire import JSON, MSGPACK, ErrorReply, decode
 from bodyschema.interfaces.errors import BusError, RequestError
 
@@ -142,7 +142,7 @@ def test_unanswered_query_names_process_to_start(asking) -> None:
 @pytest.mark.parametrize("address", ["127.0.0.1:65536", f"{'a' * 64}.org:7447", "a..org:7447"])
 def test_nothing_listens_on_an_impossible_address(address) -> None:
     route = Route((f"tcp/{address}",))
-    assert unreached(route).startswith(f"nothing listens on tcp/{address}")
+    assert unreachable(route).startswith(f"nothing listens on tcp/{address}")
     assert "is free" in zenoh_check("sampler", route, "x/alive").said
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bodyschema.daemon.transport.status import Change, JointRange, LearnerStatus, SamplerStatus
-from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
+from bodyschema.learning.status import ChainCalibration, DataOutlook, JointZero, LearntFigure
 
 SAMPLER = SamplerStatus(
     robot="arm",
@@ -35,7 +35,7 @@ CALIBRATION = ChainCalibration(
     noise_m=0.00126,
     outliers=2,
 )
-OUTLOOK = Outlook(
+OUTLOOK = DataOutlook(
     pairs=612,
     error_m=0.0006,
     least_error_m=0.0,

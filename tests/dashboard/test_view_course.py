@@ -11,7 +11,7 @@ from told_statuses import LEARNER
 
 from bodyschema.daemon.transport.status import Change, LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
-from bodyschema.dashboard.course import Course, Series, _Settings
+from bodyschema.dashboard.course import ChangeHistory, Series, _Settings
 from bodyschema.dashboard.recent import RecentPairs, RecentSettings, cloud
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
@@ -53,7 +53,7 @@ def test_series_of_months_stays_small_and_complete() -> None:
 
 
 def test_change_is_marked_once_and_named_later() -> None:
-    course = Course()
+    course = ChangeHistory()
     for pairs in (90, 100):
         course.note(learner(pairs), 1.0)
     for pairs in (101, 110, 200):
@@ -62,12 +62,12 @@ def test_change_is_marked_once_and_named_later() -> None:
     assert [(mark.pairs, mark.kind) for mark in course.document.changes] == [(100, "camera")]
 
 
-def marks(course: Course) -> list[tuple[int, str | None, bool]]:
+def marks(course: ChangeHistory) -> list[tuple[int, str | None, bool]]:
     return [(mark.pairs, mark.kind, mark.told) for mark in course.document.changes]
 
 
 def test_a_told_tool_change_is_marked_as_told() -> None:
-    course = Course()
+    course = ChangeHistory()
     told = change("tool", noticed_seq=100, found=False)
     for pairs in (100, 150):
         course.note(learner(pairs, pairs_since_change=pairs - 100, last_change=told), 1.0)
@@ -75,7 +75,7 @@ def test_a_told_tool_change_is_marked_as_told() -> None:
 
 
 def test_rolled_back_change_loses_its_mark() -> None:
-    course = Course()
+    course = ChangeHistory()
     first, second = change("camera"), change("tool", noticed_seq=200, found=False)
     course.note(learner(110, pairs_since_change=10, last_change=first), 1.0)
     course.note(learner(210, pairs_since_change=10, last_change=second), 2.0)
@@ -87,14 +87,14 @@ def test_rolled_back_change_loses_its_mark() -> None:
 
 
 def test_relocated_change_is_marked_once() -> None:
-    course = Course()
+    course = ChangeHistory()
     for since in (10, 12, 9):
         course.note(learner(110, pairs_since_change=since, last_change=change("camera")), 1.0)
     assert marks(course) == [(100, "camera", False)]
 
 
 def test_model_span_is_one_line_with_newest_version() -> None:
-    course = Course()
+    course = ChangeHistory()
     for pairs, answering, model in ((1, "nlms", "a"), (20, "nlms", "b"), (30, "rigid", "c"), (40, "rigid", "d")):
         course.note(learner(pairs, answering=answering, model=model), float(pairs))
     spans = [(span.answering, span.first_pairs, span.pairs, span.model) for span in course.document.versions]
@@ -102,14 +102,14 @@ def test_model_span_is_one_line_with_newest_version() -> None:
 
 
 def test_a_tool_change_begins_another_span() -> None:
-    course = Course()
+    course = ChangeHistory()
     course.note(learner(100), 1.0)
     course.note(learner(101, pairs_since_change=1), 2.0)
     assert [span.after_change for span in course.document.versions] == [False, True]
 
 
 def test_learning_that_began_anew_has_no_past() -> None:
-    course = Course()
+    course = ChangeHistory()
     course.note(learner(100, pairs_since_change=20), 1.0)
     course.note(learner(3, store="another"), 2.0)
     assert course.document.changes == []

@@ -29,7 +29,7 @@ from bodyschema.daemon.transport.wire import (
     encode,
 )
 from bodyschema.dashboard.hub import Hub
-from bodyschema.dashboard.watch import Watch
+from bodyschema.dashboard.watch import ProcessFollower
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.robot.urdf import inverse
 
@@ -57,8 +57,8 @@ def hub() -> Hub:
 
 
 @pytest.fixture
-def watch(config: Config, hub: Hub) -> Iterator[Watch]:
-    with Watch(config, hub) as watch:
+def watch(config: Config, hub: Hub) -> Iterator[ProcessFollower]:
+    with ProcessFollower(config, hub) as watch:
         yield watch
 
 
@@ -142,7 +142,7 @@ def test_learner_behind_router_is_seen(tmp_path, hub, free_endpoint, here) -> No
     with (
         ZenohSession(listen=meeting, settings={"mode": "router"}),
         process(own if here else free_endpoint(), "learner", LEARNER, {}, meeting),
-        Watch(config, hub),
+        ProcessFollower(config, hub),
     ):
         until(lambda: (found := document(hub, "learner")) and found["answers"])
 
@@ -213,7 +213,7 @@ def test_many_browsers_cause_one_picture_request(config, hub, watch) -> None:
     assert len(asked) <= 2
 
 
-def _pictured(watch: Watch) -> bytes | None:
+def _pictured(watch: ProcessFollower) -> bytes | None:
     try:
         return watch.picture()
     except BusError:
@@ -227,7 +227,7 @@ def test_a_command_gets_the_process_own_words(config, watch) -> None:
             watch.command("learner", "pause")
 
 
-def _answered(watch: Watch) -> bool:
+def _answered(watch: ProcessFollower) -> bool:
     try:
         return watch.command("learner", "tool_changed") == "another tool"
     except BusError:

@@ -42,19 +42,19 @@ def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
 
 
 def test_settling_joint_is_trusted_after_its_memory_decays(robot) -> None:
-    lacking = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])).doubtful()
+    lacking = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])).unknown_history()
     rows = np.flatnonzero(lacking[:RUN])
     # 0.3 and 0.09 of it are more than a twentieth, 0.027 is not; the first row is never trusted in a walk.
     np.testing.assert_array_equal(rows, [1, 2])
 
 
 def test_joint_without_memory_is_trusted_at_once(robot) -> None:
-    assert not in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0])).doubtful().any()
+    assert not in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0])).unknown_history().any()
 
 
 def test_excluding_unsettled_rows_leaves_no_outliers(robot) -> None:
     fit = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.5, 0.3]))
-    again = aligned(fit.observations.without(fit.doubtful()), Simulation(robot)).with_causes(fit.causes)
+    again = aligned(fit.observations.ignoring(fit.unknown_history()), Simulation(robot)).with_causes(fit.causes)
     assert fit.noise.share > 0.02
     assert again.noise.share < 0.005
 
@@ -71,8 +71,8 @@ def test_backlash_side_is_trusted_after_first_crossing(robot) -> None:
     fit = in_runs(robot, Effect.at(robot, "backlash", SHOULDER, values=[0.2]))
     reached = fit.observations.motion.q[:, robot.joints.index(SHOULDER)]
     crossed = np.maximum.accumulate(reached) - np.minimum.accumulate(reached) >= fit.causes[0].values[0]
-    assert fit.doubtful()[crossed].any()
-    np.testing.assert_array_equal(fit.doubtful_at_first[1:], ~crossed[1:])
+    assert fit.unknown_history()[crossed].any()
+    np.testing.assert_array_equal(fit.unknown_history_at_first[1:], ~crossed[1:])
 
 
 @pytest.mark.parametrize("seed", [3, 4])
@@ -80,7 +80,7 @@ def test_rarely_crossed_backlash_is_the_only_cause_found(robot, seed) -> None:
     play = Effect.at(robot, "backlash", SHOULDER, values=[0.2])
     found = diagnose(recorded(robot, play, seed=seed), Simulation(robot))
     assert [cause.key for cause in found.causes] == [play.key]
-    assert not found.left.is_there
+    assert not found.unexplained.is_present
 
 
 def test_backlash_side_is_unknown_only_within_friction_band(robot) -> None:

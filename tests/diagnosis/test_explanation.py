@@ -14,12 +14,12 @@ from bodyschema.diagnosis.assess import explanation
 from bodyschema.diagnosis.assess.explanation import Explanation, explain, useful
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.net_evidence import WorthSettings
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.families import families
-from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies, Way
+from bodyschema.diagnosis.unnamed.family_fits import PreparedFamily, UnnamedFamilies
 from bodyschema.effects import Effect, Simulation
 
 
@@ -29,17 +29,19 @@ class Believing:
     def predicts(self, *_: object) -> bool:
         return True
 
-    def doubt_of(self, _: Effect) -> float:
+    def multiplicity_penalty_of(self, _: Effect) -> float:
         return 0.0
 
 
-def explained_beside(fits: list[Fit], worths: list[float], monkeypatch: pytest.MonkeyPatch) -> Explanation:
+def explained_beside(fits: list[Fit], net_evidences: list[float], monkeypatch: pytest.MonkeyPatch) -> Explanation:
     """Return the explanation chosen from fits of these worths: the last has no direction, the others share one."""
-    way = SimpleNamespace(family=SimpleNamespace(what="something", is_specific=False))
-    apart = cast(Any, SimpleNamespace(chosen=(way,), fit=fits[0]))
+    prepared = SimpleNamespace(family=SimpleNamespace(what="something", is_specific=False))
+    discrepancy_fit = cast(Any, SimpleNamespace(chosen=(prepared,), fit=fits[0]))
     known = {
-        fit: Explanation(fit, None if fit is fits[-1] else apart, worth, size=1e6, promise=1e6)
-        for fit, worth in zip(fits, worths, strict=True)
+        fit: Explanation(
+            fit, None if fit is fits[-1] else discrepancy_fit, net_evidence, size=1e6, best_unnamed_gain=1e6
+        )
+        for fit, net_evidence in zip(fits, net_evidences, strict=True)
     }
     shorter = {len(fit.causes): one for fit, one in known.items()}
     monkeypatch.setattr(explanation, "_with_unnamed", lambda fit, *_: known.get(fit) or shorter[len(fit.causes)])
@@ -80,7 +82,7 @@ def test_unnamed_family_shown_by_few_rows_is_kept() -> None:
     start = aligned(Observations.of(recording, simulation), simulation)
     unnamed = UnnamedFamilies(start)
     (family,) = (one for one in families(start.run) if (one.joint, one.drivers) == (shoulder, (shoulder, elbow)))
-    assert unnamed.predicts(unnamed.apart(start, (Way.of(family, start),)), start)
+    assert unnamed.predicts(unnamed.discrepancy_fit(start, (PreparedFamily.of(family, start),)), start)
 
 
 def test_autocorrelated_noise_replaces_no_cause_by_unnamed_error() -> None:

@@ -9,8 +9,8 @@ from planted_cases import desk_arm, measured, start_of, walk
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.unnamed.families import Family, families
-from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies, Way
+from bodyschema.diagnosis.unnamed.families import DiscrepancyFamily, families
+from bodyschema.diagnosis.unnamed.family_fits import PreparedFamily, UnnamedFamilies
 from bodyschema.effects import Simulation
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import model_file
@@ -23,7 +23,7 @@ def start() -> Fit:
 
 
 @pytest.fixture(scope="module")
-def found(start) -> list[Family]:
+def found(start) -> list[DiscrepancyFamily]:
     return families(start.run)
 
 
@@ -41,7 +41,7 @@ def test_subfamily_moves_as_the_whole_family_does(start, found) -> None:
     bodies = [family for family in found if family.kind == "body" and family.ties is None]
     assert bodies
     for family in bodies:
-        way = Way.of(family, start)
+        way = PreparedFamily.of(family, start)
         part = way.along(np.linalg.qr(rng.normal(size=(way.amounts, 2)))[0])
         numbers = rng.normal(size=len(part.scales)) / part.scales
         whitened = start.observations.whitened((part.family.columns(start.run) @ numbers)[:, :, None]).ravel()
@@ -57,7 +57,7 @@ def test_link_compliant_at_near_end_rotates_about_carrier() -> None:
     for k in joints:
         what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
         *_, family = (one for one in found if one.what == what and one.ties is not None and not one.is_specific)
-        T_camera_carrier = run.frames[:, k] @ np.linalg.inv(gravity.in_supports(k)[-1])
+        T_camera_carrier = run.frames[:, k] @ np.linalg.inv(gravity.in_support_frames(k)[-1])
         axes, lever = T_camera_carrier[:, :3, :3], run.measured - T_camera_carrier[:, :3, 3]
         turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :]).swapaxes(1, 2)
         np.testing.assert_allclose(family.moves(run)[:, :, 3:], turned, atol=1e-9)

@@ -201,7 +201,9 @@ def test_barely_observed_time_constant_has_large_uncertainty(robot) -> None:
 
 def test_hopeless_fit_is_given_up_within_three_steps(robot, monkeypatch) -> None:
     truth = Effect.at(robot, "joint_offset", SHOULDER, values=[0.02])
-    other = start_of(robot, walk(robot, 1), (truth,), 1).starting([Effect.at(robot, "joint_scale", SHOULDER)])
+    other = start_of(robot, walk(robot, 1), (truth,), 1).with_unfitted_causes(
+        [Effect.at(robot, "joint_scale", SHOULDER)]
+    )
     best = improved(other).log_likelihood
     assert improved(other, best).log_likelihood == best
     taken, step = [], Fit.step
@@ -214,7 +216,7 @@ def test_distant_start_among_outliers_still_converges(robot) -> None:
     clean = observed(robot, walk(robot, 5), planted(robot), 5)
     rows = np.random.default_rng(6).choice(len(clean), len(clean) // 10, replace=False)
     best = refitted(robot, with_outliers(clean, rows))
-    far = best.starting([e.with_values(np.asarray(e.values) + 0.1) for e in best.causes])
+    far = best.with_unfitted_causes([e.with_values(np.asarray(e.values) + 0.1) for e in best.causes])
     assert improved(far, best.log_likelihood - 1.0).log_likelihood > best.log_likelihood - 1.0
 
 
@@ -223,14 +225,14 @@ def test_prior_disfavours_large_undetermined_amounts(robot) -> None:
     # Guided torque-free: no weight bends a joint.
     none = Effect.at(robot, "joint_compliance", ELBOW)
     large = none.with_values(np.array([20.0 * parameter.usual for parameter in none.parameters]))
-    one, other = (start.starting([effect]) for effect in (none, large))
+    one, other = (start.with_unfitted_causes([effect]) for effect in (none, large))
     np.testing.assert_array_equal(one.run.measured, other.run.measured)
     assert one.log_likelihood - other.log_likelihood > 1.5
 
 
 def test_kept_derivatives_lead_to_the_same_fit(robot) -> None:
     full = refitted(robot, observed(robot, walk(robot, 6), planted(robot), 6))
-    kept = full.starting(full.causes[1:])
+    kept = full.with_unfitted_causes(full.causes[1:])
     own = dataclasses.replace(kept, tangent=None)
     assert kept.tangent is not None
     # Differences of this size decide nothing.

@@ -81,7 +81,7 @@ def test_predicted_pose_covariance_is_absent_without_fitted_effects() -> None:
 
 
 def test_tolerances_alone_have_a_covariance_of_predicted_poses() -> None:
-    fit = found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored.tolerating(Scales())
+    fit = found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored.with_tolerances(Scales())
     cov = predicted_pose_covariance(fit)
     assert cov is not None
     assert np.linalg.eigvalsh(cov).min() > 0.0

@@ -11,7 +11,7 @@ from planted_cases import SHOULDER, Motion, desk_arm, seen, walk
 from bodyschema.diagnosis.assess.explanation import Explanation, useful
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.report.conclusion import conclusion
-from bodyschema.diagnosis.search.search import Search, are_a_description
+from bodyschema.diagnosis.search.search import Search, are_only_descriptive
 from bodyschema.effects import Effect, Simulation
 
 
@@ -42,13 +42,13 @@ def test_truncated_search_is_unexplained(small) -> None:
 
 def test_many_jumps_are_a_description_not_an_explanation(small) -> None:
     robot = small.extended.simulation.robot
-    jumps = [Effect.at(robot, "encoder_jump", SHOULDER).one_more(k) for k in range(4)]
-    assert are_a_description(jumps)
-    assert not are_a_description([*jumps[:3], *small.causes])
+    jumps = [Effect.at(robot, "encoder_jump", SHOULDER).with_ordinal(k) for k in range(4)]
+    assert are_only_descriptive(jumps)
+    assert not are_only_descriptive([*jumps[:3], *small.causes])
 
 
 def test_rejected_effect_with_small_p_value_has_reason(small) -> None:
-    rest = dataclasses.replace(small, extended=small.aligned, standings=())
+    rest = dataclasses.replace(small, extended=small.aligned, assessments=())
     rows = {(row.effect, row.where): row for row in conclusion(rest).rejected}
     assert rows["joint_offset", SHOULDER].p_value < 1e-3
     assert rows["joint_offset", SHOULDER].why
@@ -69,7 +69,7 @@ def test_rarely_crossed_backlash_is_reported_with_remedy() -> None:
 def test_cause_without_held_out_gain_is_dropped(small) -> None:
     fit, robot = small.extended, small.extended.simulation.robot
     impossible = Effect.at(robot, "backlash", SHOULDER, values=[-0.001])
-    begun = Explanation(fit.starting([*fit.causes, impossible]), None, 0.0)
+    begun = Explanation(fit.with_unfitted_causes([*fit.causes, impossible]), None, 0.0)
     search = Search(small.hypotheses.effects, lambda _: None)
     kept = useful(begun, search, small.blocks, lambda _: None).fit.causes
     assert [cause.key for cause in kept] == [cause.key for cause in fit.causes]

@@ -48,16 +48,16 @@ def test_partial_motion_keeps_clock_and_splits_at_gaps() -> None:
 
 
 def test_long_recording_is_sampled_from_end_to_end() -> None:
-    rows = diagnosis._part_of(np.zeros(ROWS, dtype=np.bool_))
+    rows = diagnosis._searched_rows(np.zeros(ROWS, dtype=np.bool_))
     assert (rows[0], rows[-1], len(rows)) == (0, ROWS - 1, PART)
-    assert len(diagnosis._part_of(np.zeros(2 * PART, dtype=np.bool_))) == 2 * PART
+    assert len(diagnosis._searched_rows(np.zeros(2 * PART, dtype=np.bool_))) == 2 * PART
 
 
 def test_sampled_runs_avoid_breaks_in_the_recording() -> None:
     begins = np.zeros(ROWS, dtype=np.bool_)
     begins[::ROWS] = True
     begins[[70, 75, 80, 85]] = True  # from 68 to 87 would be the second run
-    rows = diagnosis._part_of(begins).reshape(-1, 20)
+    rows = diagnosis._searched_rows(begins).reshape(-1, 20)
     assert rows[1, 0] == 85
     np.testing.assert_array_equal(rows[2], np.arange(136, 156))
 
@@ -90,6 +90,6 @@ def test_unnamed_error_is_learnt_from_all_rows() -> None:
     file = conclusion(found)
     assert file.verdict == "unexplained"
     assert WRIST not in file.unexplained.depends_on
-    assert found.left.model is not None
-    assert len(found.left.model.explained) == ROWS
+    assert found.unexplained.model is not None
+    assert len(found.unexplained.model.explained) == ROWS
     assert file.rms_mm.extended < 1.3e3 * np.sqrt(3.0) * SIGMA_M

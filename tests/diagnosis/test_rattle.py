@@ -16,7 +16,7 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle, rattle_beside
+from bodyschema.diagnosis.unnamed.rattle import LooseMarker, rattle, rattle_with_refit
 from bodyschema.diagnosis.unnamed.rattle import _Settings as Limits
 from bodyschema.effects import Effect, Simulation
 
@@ -49,9 +49,9 @@ def test_marker_on_its_gravity_side_is_loose() -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(6)
     motion = walk(robot, 2)
     run, way = Simulation(robot).run(motion), np.array([0.6, 0.0, 0.8])
-    ways = run.columns(Effect.at(robot, "tool_offset")) @ way
-    down = (ways @ run.simulation.camera_pose[:3, :3].T)[:, 2]
-    x = run.measured + HALF_M * np.sign(down)[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    directions = run.columns(Effect.at(robot, "tool_offset")) @ way
+    down = (directions @ run.simulation.camera_pose[:3, :3].T)[:, 2]
+    x = run.measured + HALF_M * np.sign(down)[:, None] * directions + SIGMA_M * rng.normal(size=directions.shape)
     found = conclusion(diagnose(measured(robot, motion, x), Simulation(robot)))
     assert (found.verdict, found.causes) == ("unexplained", ())
     assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=0.1)
@@ -67,8 +67,8 @@ def beside_tolerances(seed: int, changes: tuple[int, ...]) -> DiagnosisFile:
     motion = walk(robot, seed)
     run = Simulation(robot, tuple(links)).run(motion)
     beyond = 2.0 * HALF_M * (np.searchsorted(changes, np.arange(len(motion)), "right") % 2)
-    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
-    x = run.measured + beyond[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    directions = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + beyond[:, None] * directions + SIGMA_M * rng.normal(size=directions.shape)
     return conclusion(diagnose(measured(robot, motion, x), Simulation(robot)))
 
 
@@ -99,7 +99,7 @@ def test_outliers_are_no_second_side(count) -> None:
     motion = walk(robot, 5, rows=150)
     x = Simulation(robot).positions(motion) + SIGMA_M * rng.normal(size=(150, 3))
     x[rng.choice(150, count, replace=False)] += 6e-3 * rng.normal(size=(count, 3))
-    assert diagnose(measured(robot, motion, x), Simulation(robot)).left.rattle is None
+    assert diagnose(measured(robot, motion, x), Simulation(robot)).unexplained.rattle is None
 
 
 def test_marker_side_is_undetermined_beside_a_change() -> None:
@@ -107,8 +107,8 @@ def test_marker_side_is_undetermined_beside_a_change() -> None:
     motion = walk(robot, 3)
     run = Simulation(robot).run(motion)
     sides = np.where(np.arange(len(motion)) // 50 % 2, HALF_M, -HALF_M)
-    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
-    x = run.measured + sides[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    directions = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + sides[:, None] * directions + SIGMA_M * rng.normal(size=directions.shape)
     play = rattle(aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot)))
     assert play is not None
     changes = np.arange(50, 300, 50)
@@ -120,8 +120,8 @@ def test_marker_changing_side_once_has_no_play() -> None:
     motion = walk(robot, 3)
     run = Simulation(robot).run(motion)
     sides = np.where(np.arange(len(motion)) < 120, HALF_M, -HALF_M)
-    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
-    x = run.measured + sides[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    directions = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + sides[:, None] * directions + SIGMA_M * rng.normal(size=directions.shape)
     assert rattle(aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))) is None
 
 
@@ -134,8 +134,8 @@ def test_clear_marker_play_is_insensitive_to_the_limits(monkeypatch, limit, fact
     simulation, motion = Simulation(robot), scattered(robot, 1, rows=150)
     run = simulation.run(motion)
     x = run.measured + SIGMA_M * rng.normal(size=(150, 3))
-    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
-    moved = x + HALF_M * rng.choice([-1.0, 1.0], 150)[:, None] * ways
+    directions = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    moved = x + HALF_M * rng.choice([-1.0, 1.0], 150)[:, None] * directions
     usual = getattr(Limits, limit)
     monkeypatch.setattr(Limits, limit, type(usual)(factor * usual))
     fixed, loose = (aligned(Observations.of(measured(robot, motion, at), simulation), simulation) for at in (x, moved))
@@ -150,8 +150,8 @@ def test_a_loose_marker_without_noise_is_loose(seed) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(seed + 5)
     motion = scattered(robot, seed, rows=100)
     run = Simulation(robot).run(motion)
-    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
-    x = run.measured + HALF_M * rng.choice([-1.0, 1.0], 100)[:, None] * ways
+    directions = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + HALF_M * rng.choice([-1.0, 1.0], 100)[:, None] * directions
     found = conclusion(diagnose(measured(robot, motion, x), Simulation(robot)))
     assert (found.verdict, found.causes) == ("unexplained", ())
     assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=1e-3)
@@ -174,9 +174,9 @@ def test_loose_marker_keeps_noise_factor_and_excluded_rows(monkeypatch) -> None:
         raise Searched
 
     alignment, axis = diagnosis.aligned, np.array([0.0, 0.0, 1.0])
-    loose = Rattle(HALF_M, 3.0, axis, ways=np.tile(axis, (40, 1)), sides=np.zeros(40), likelihood=0.0)
+    loose = LooseMarker(HALF_M, 3.0, axis, directions=np.tile(axis, (40, 1)), sides=np.zeros(40), likelihood=0.0)
     monkeypatch.setattr(diagnosis, "aligned", aligned)
-    monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.tolerating(diagnosis.Scales()))
+    monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.with_tolerances(diagnosis.Scales()))
     monkeypatch.setattr(diagnosis, "_searched", lambda begun, *_: begun)
     monkeypatch.setattr(diagnosis, "instrument_factor", lambda _: 2.0)
     monkeypatch.setattr(diagnosis, "_left_out", lambda _: left_out)
@@ -187,9 +187,9 @@ def test_loose_marker_keeps_noise_factor_and_excluded_rows(monkeypatch) -> None:
     monkeypatch.setattr(diagnosis, "useful", explained)
     with pytest.raises(Searched):
         diagnosis.diagnose(measured(robot, motion, x), simulation)
-    assert begun[-1].rattling is not None
+    assert begun[-1].play_covariance is not None
     assert begun[-1].stated_factor == 2.0
-    assert (begun[-1].doubtful == left_out).all()
+    assert (begun[-1].ignored == left_out).all()
 
 
 def test_loose_marker_and_causes_share_the_compared_rows(monkeypatch) -> None:
@@ -205,7 +205,7 @@ def test_loose_marker_and_causes_share_the_compared_rows(monkeypatch) -> None:
         compared.extend(fits)
         raise Compared
 
-    monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.tolerating(diagnosis.Scales()))
+    monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.with_tolerances(diagnosis.Scales()))
     monkeypatch.setattr(diagnosis, "_searched", lambda begun, *_: begun)
     monkeypatch.setattr(diagnosis, "_left_out", lambda _: next(left_out))
     monkeypatch.setattr(diagnosis, "reshaped", lambda _: None)
@@ -242,4 +242,4 @@ def test_imprecise_rows_are_not_a_second_marker_side(seed) -> None:
     exact = measured(robot, motion, x)
     stated = np.array([root @ root.T for root in roots])
     recording = replace(exact, cov=0.5 * (stated + np.swapaxes(stated, 1, 2)))
-    assert rattle_beside(aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))) is None
+    assert rattle_with_refit(aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))) is None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from walked import DESK_ARM
 
-from bodyschema.diagnosis.report.numbers import number, numbers_of, percent, telling
+from bodyschema.diagnosis.report.numbers import number, numbers_of, percent, significant_numbers
 from bodyschema.diagnosis.report.result import (
     Cause,
     DiagnosisFile,
@@ -188,7 +188,7 @@ def test_undetermined_numbers_are_omitted(robot) -> None:
     known = cause(effect)
     known.parameters["y_m"] = Interval(0.0, (-0.3, 0.3))
     known.parameters["z_m"] = Interval(0.001, (-0.002, 0.004))
-    labels = [n.label for n in telling(numbers_of(known, timed=True))]
+    labels = [n.label for n in significant_numbers(numbers_of(known, timed=True))]
     assert labels == ["shift in x", "turn about x", "turn about y", "turn about z"]
 
 

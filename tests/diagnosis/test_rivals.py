@@ -123,11 +123,11 @@ def test_following_the_advice_separates_the_rivals(planted, open_case) -> None:
 @pytest.mark.soak
 def test_advised_motion_separates_simulations_of_both_rivals(open_case) -> None:
     robot = surveyed_arm()
-    (standing,) = open_case.standings
-    (rival,) = standing.rivals
+    (assessment,) = open_case.assessments
+    (rival,) = assessment.rivals
     (advice,) = conclusion(open_case).advice
     motion = advised(robot, advice)
-    for simulation in (open_case.extended.simulation, rival.instead.simulation):
+    for simulation in (open_case.extended.simulation, rival.fit_with_it.simulation):
         (effect,) = simulation.effects
         file = conclusion(diagnosed(robot, motion, effect, NARROW))
         assert [(cause.effect, cause.rivals) for cause in file.causes] == [(effect.name, ())]
@@ -138,7 +138,7 @@ def test_small_effects_are_not_equivalent_in_any_motion() -> None:
     truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.0018, 0.0])
     kinds = ("joint_eccentricity", "joint_scale")
     found = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds)
-    rivals = [rival for standing in found.standings for rival in standing.rivals]
+    rivals = [rival for assessment in found.assessments for rival in assessment.rivals]
     assert rivals
     assert not any(rival.is_same_anywhere for rival in rivals)
     assert conclusion(found).advice[0].startswith("To tell an eccentric encoder of joint ")
@@ -149,13 +149,15 @@ def test_more_flexible_rival_does_not_raise_cause_s_probability() -> None:
     motion = walk(robot, 2, ROWS)
     truth = Effect.at(robot, "encoder_jump", robot.joints[-1], values=[0.02, float(motion.clock[ROWS // 2]) + 0.01])
     found = diagnosed(robot, motion, truth, ("encoder_jump", "tool_slip"))
-    (standing,) = found.standings
+    (assessment,) = found.assessments
     (rival,) = (
-        rival for rival in standing.rivals if isinstance(rival.itself, Effect) and rival.itself.name == "tool_slip"
+        rival
+        for rival in assessment.rivals
+        if isinstance(rival.hypothesis, Effect) and rival.hypothesis.name == "tool_slip"
     )
     assert rival.is_same_anywhere
-    assert not rival.is_one
-    assert standing.probability < 1.0 - rival.probability + 1e-9
+    assert not rival.is_equivalent
+    assert assessment.probability < 1.0 - rival.probability + 1e-9
     assert any("from a marker that slipped, which can do more besides" in line for line in conclusion(found).advice)
 
 
@@ -223,9 +225,9 @@ def test_clearly_distinguished_cause_has_no_rivals() -> None:
     robot = desk_arm()
     truth = Effect.at(robot, "joint_scale", SHOULDER, values=[0.02])
     kinds = ("joint_offset", "joint_scale", "joint_eccentricity", "backlash")
-    (standing,) = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds).standings
-    assert standing.rivals == ()
-    assert standing.probability > 0.999
+    (assessment,) = diagnosed(robot, walk(robot, 2, ROWS), truth, kinds).assessments
+    assert assessment.rivals == ()
+    assert assessment.probability > 0.999
 
 
 def test_advised_range_of_unlimited_prismatic_joint_is_short() -> None:

@@ -59,7 +59,7 @@ def test_small_effect_gain_is_twice_the_likelihood_rise(robot, name, where, sour
 @pytest.mark.parametrize("free", [(0,), (1, 5)])
 def test_scan_frees_only_the_changed_link_parameters(free) -> None:
     arm, values = surveyed_arm(), np.array([3e-3, 2e-3, 0.0, 0.0, 0.0, 0.02])
-    planted = Effect.at(arm, "link_geometry", ELBOW, values=values).freeing(free)
+    planted = Effect.at(arm, "link_geometry", ELBOW, values=values).with_free_amounts(free)
     found = scanned(arm, planted, 3).effect
     assert found.free == free
     assert list(found.table()) == ["effect", "where", *(planted.parameters[k].name for k in free)]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, desk_arm, measured, motion_of
 
-from bodyschema.diagnosis.assess.rivals import standings
+from bodyschema.diagnosis.assess.rivals import assessments
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.net_evidence import WorthSettings, evidence_gain
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import instruments
-from bodyschema.diagnosis.fit.worth import WorthSettings, nats
 from bodyschema.diagnosis.search.held_out import Blocks, block_p_value
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.effects import Effect, Motion, Simulation
@@ -25,7 +25,7 @@ ROWS, SIGMA_M, SCATTER_RAD = 1200, 5e-5, np.radians(0.04)
 # Probabilities of no memory at all.
 HARDLY, CLEARLY = 1e-3, 1e-4
 SEEDS = range(5)
-Way = Callable[[RobotDescription, np.random.Generator], Motion]
+PreparedFamily = Callable[[RobotDescription, np.random.Generator], Motion]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,11 @@ def poses(robot: RobotDescription, rng: np.random.Generator) -> Motion:
 
 
 def fit_of(
-    robot: RobotDescription, seed: int, *effects: Effect, way: Way = slow_way, scatter_rad: float = SCATTER_RAD
+    robot: RobotDescription,
+    seed: int,
+    *effects: Effect,
+    way: PreparedFamily = slow_way,
+    scatter_rad: float = SCATTER_RAD,
 ) -> Fit:
     """Return the simulation without effects, aligned to noisy readings."""
     rng = np.random.default_rng([seed, 21])
@@ -119,7 +123,7 @@ def with_false_play(robot: RobotDescription, seed: int) -> tuple[Fit, Search]:
     """Return a fit with a backlash that the joint does not have; noisy readings make the likelihood favour it."""
     fit, search = fit_of(robot, seed), Search([Effect.at(robot, "backlash", ELBOW)], lambda _: None)
     false = fit.with_causes([Effect.at(robot, "backlash", ELBOW, values=[0.3 * SCATTER_RAD])])
-    assert nats(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > WorthSettings.named_nats
+    assert evidence_gain(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > WorthSettings.named_nats
     return false, search
 
 
@@ -132,8 +136,8 @@ def test_search_removes_backlash_due_to_reading_noise(robot, seed) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_backlash_due_to_reading_noise_is_not_sure(robot, seed) -> None:
     false, search = with_false_play(robot, seed)
-    (standing,) = standings(false, search, Blocks.cut(ROWS), 0)
-    assert standing.probability < 0.9
+    (assessment,) = assessments(false, search, Blocks.cut(ROWS), 0)
+    assert assessment.probability < 0.9
 
 
 class LagOfAnotherPackage(Settling):

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, WRIST, at_rest, desk_arm, start_of, surveyed_arm, walk
 
-from bodyschema.diagnosis.assess.rivals import standings
+from bodyschema.diagnosis.assess.rivals import assessments
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import WorthSettings, nats, rise_for
+from bodyschema.diagnosis.fit.net_evidence import WorthSettings, evidence_gain, required_rise
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate, Scan
-from bodyschema.diagnosis.search.search import Search, contains, simplicity
+from bodyschema.diagnosis.search.search import Search, complexity, contains
 from bodyschema.diagnosis.search.together import together
 from bodyschema.effects import Effect
 from bodyschema.robot.description import RobotDescription
@@ -32,27 +32,27 @@ def names(fit: Fit) -> set[tuple[str, str | None]]:
 
 
 def test_zero_gain_without_parameters_is_worth_nothing() -> None:
-    assert nats(0.0, 0) == 0.0
+    assert evidence_gain(0.0, 0) == 0.0
 
 
 @given(NUMBERS)
 def test_numbers_that_explain_nothing_cost_something(dof: int) -> None:
-    assert nats(0.0, dof) < 0.0
+    assert evidence_gain(0.0, dof) < 0.0
 
 
 @given(GAINS, NUMBERS)
 def test_more_parameters_at_equal_gain_are_worth_less(gain: float, dof: int) -> None:
-    assert nats(gain, dof + 1) < nats(gain, dof) < nats(gain, 0)
+    assert evidence_gain(gain, dof + 1) < evidence_gain(gain, dof) < evidence_gain(gain, 0)
 
 
 @given(GAINS, st.floats(0.01, 1e3), NUMBERS)
 def test_more_gain_with_equal_parameters_is_worth_more(gain: float, more: float, dof: int) -> None:
-    assert nats(gain + more, dof) > nats(gain, dof)
+    assert evidence_gain(gain + more, dof) > evidence_gain(gain, dof)
 
 
 @given(st.floats(-1e5, 1e5), st.integers(-12, 12))
 def test_worth_of_exchange_is_antisymmetric(gain: float, dof: int) -> None:
-    assert nats(-gain, -dof) == pytest.approx(-nats(gain, dof), abs=1e-9)
+    assert evidence_gain(-gain, -dof) == pytest.approx(-evidence_gain(gain, dof), abs=1e-9)
 
 
 def test_cause_made_redundant_by_better_one_is_dropped(robot) -> None:
@@ -95,7 +95,7 @@ def test_simpler_of_two_equivalent_causes_is_named(first) -> None:
     robot = surveyed_arm()
     truth = Effect.at(robot, "link_geometry", BASE, values=[0.004, -0.003, 0.002, 0.01, -0.02, 0.015])
     pose, link = Effect.at(robot, "camera_pose"), Effect.at(robot, "link_geometry", BASE)
-    assert simplicity(pose) < simplicity(link)
+    assert complexity(pose) < complexity(link)
     start = start_of(robot, walk(robot, 2), (truth,), 2)
     hypotheses = [pose, link] if first == "camera_pose" else [link, pose]
     assert names(Search(hypotheses, lambda _: None).run(start)) == {("camera_pose", None)}
@@ -126,7 +126,7 @@ def test_offset_is_preferred_to_slightly_better_link(from_link) -> None:
 def test_link_contains_offsets_of_its_end_joints(where, free, contained) -> None:
     robot = surveyed_arm()
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.03])
-    link = Effect.at(robot, "link_geometry", where, values=[0.02] * 6).freeing(free)
+    link = Effect.at(robot, "link_geometry", where, values=[0.02] * 6).with_free_amounts(free)
     fit = start_of(robot, walk(robot, 2, 60), (offset,), 2).with_causes([offset])
     assert contains(fit, link, fit.causes[0]) is contained
 
@@ -135,7 +135,7 @@ def test_second_joint_offset_needs_less_evidence_than_first(robot) -> None:
     first, offset = (Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, SHOULDER))
     scale = Effect.at(robot, "joint_scale", ELBOW)
     search, candidate = Search([offset] * 100, lambda _: None), Candidate(offset, 10.0, 1)
-    assert search.doubt(candidate, [first]) < search.doubt(candidate, [scale])
+    assert search.multiplicity_penalty(candidate, [first]) < search.multiplicity_penalty(candidate, [scale])
 
 
 def test_last_joint_jump_costs_less_than_tool_slip(robot) -> None:
@@ -144,9 +144,9 @@ def test_last_joint_jump_costs_less_than_tool_slip(robot) -> None:
     slip = Effect.at(robot, "tool_slip", None, values={"t0": float(motion.clock[150])})
     search = Search([jump, slip], lambda _: None)
     fit = start_of(robot, motion, (jump,), 6).with_causes([slip])
-    beside = search.beside(fit, fit.causes[0])
+    leave_one_out = search.leave_one_out(fit, fit.causes[0])
     # Three numbers of a large slip have to explain far more than one of a jump.
-    assert beside.cost_of(beside.candidates[0]) < -6.0
+    assert leave_one_out.cost_of(leave_one_out.candidates[0]) < -6.0
 
 
 def test_jump_is_more_probable_than_tool_slip(robot) -> None:
@@ -156,22 +156,25 @@ def test_jump_is_more_probable_than_tool_slip(robot) -> None:
     slip = Effect.at(robot, "tool_slip", None, values={"t0": t0})
     search = Search([jump, slip], lambda _: None)
     fit = start_of(robot, motion, (jump,), 6).with_causes([slip])
-    (standing,) = standings(fit, search, Blocks.cut(len(motion)), 0)
-    assert standing.rivals[0].probability > 0.99
+    (assessment,) = assessments(fit, search, Blocks.cut(len(motion)), 0)
+    assert assessment.rivals[0].probability > 0.99
 
 
 def test_cause_names_are_charged_regardless_of_order(robot) -> None:
     offset, scale = (Effect.at(robot, name, ELBOW) for name in ("joint_offset", "joint_scale"))
     search = Search([offset] * 100, lambda _: None)
-    alone, beside = search.doubt(Candidate(scale, 10.0, 1)), search.doubt(Candidate(scale, 10.0, 1), [offset])
-    assert alone + beside == pytest.approx(np.log(100 * 100 / 2))
+    alone, leave_one_out = (
+        search.multiplicity_penalty(Candidate(scale, 10.0, 1)),
+        search.multiplicity_penalty(Candidate(scale, 10.0, 1), [offset]),
+    )
+    assert alone + leave_one_out == pytest.approx(np.log(100 * 100 / 2))
 
 
 def test_all_joint_offsets_have_one_name(robot) -> None:
     offsets = [Effect.at(robot, "joint_offset", joint) for joint in (ELBOW, SHOULDER)]
     scale = Candidate(Effect.at(robot, "joint_scale", ELBOW), 10.0, 1)
     search = Search([scale.effect] * 100, lambda _: None)
-    assert search.doubt(scale, offsets) == search.doubt(scale, offsets[:1])
+    assert search.multiplicity_penalty(scale, offsets) == search.multiplicity_penalty(scale, offsets[:1])
 
 
 def test_link_gives_way_to_offsets_it_contains(robot) -> None:
@@ -200,7 +203,7 @@ def test_required_evidence_rises_with_hypothesis_count(robot) -> None:
     offset = Effect.at(robot, "joint_offset", ELBOW)
     few, many = Search([offset], lambda _: None), Search([offset] * 100, lambda _: None)
     (candidate,) = few.shortlist(Scan(start), [offset])
-    assert many.doubt(candidate) > few.doubt(candidate) + WorthSettings.named_nats
+    assert many.multiplicity_penalty(candidate) > few.multiplicity_penalty(candidate) + WorthSettings.named_nats
 
 
 class Undecided(Search):
@@ -208,7 +211,7 @@ class Undecided(Search):
 
     asked = 0
 
-    def _second_thoughts(self, fit: Fit, cause: Effect) -> Fit | None:
+    def _reconsider(self, fit: Fit, cause: Effect) -> Fit | None:
         self.asked += 1
         if self.asked > 20:
             pytest.fail("the same sets of causes are tried again and again")
@@ -229,9 +232,9 @@ class Reviewing(Search):
 
     reviewed: list[str]
 
-    def _second_thoughts(self, fit: Fit, cause: Effect) -> Fit | None:
+    def _reconsider(self, fit: Fit, cause: Effect) -> Fit | None:
         self.reviewed.append(cause.name)
-        return super()._second_thoughts(fit, cause)
+        return super()._reconsider(fit, cause)
 
 
 def test_dominant_cause_is_not_reviewed_after_small_change(robot) -> None:
@@ -331,6 +334,6 @@ def test_two_offsets_are_preferred_to_the_equivalent_link() -> None:
 
 
 @given(st.floats(0.0, 1e4), st.integers(0, 6))
-def test_rise_for_inverts_the_worth(worth, dof) -> None:
-    assert abs(nats(2.0 * rise_for(worth, dof), dof) - worth) < 1e-3
-    assert abs(nats(2.0 * rise_for(-worth, -dof), -dof) + worth) < 1e-3
+def test_rise_for_inverts_the_worth(net_evidence, dof) -> None:
+    assert abs(evidence_gain(2.0 * required_rise(net_evidence, dof), dof) - net_evidence) < 1e-3
+    assert abs(evidence_gain(2.0 * required_rise(-net_evidence, -dof), -dof) + net_evidence) < 1e-3

@@ -24,12 +24,17 @@ from planted_cases import (
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.net_evidence import choice_counts
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.fit.worth import ways_to_choose
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.sets import Sets
-from bodyschema.diagnosis.search.together import _Place, in_place_of_tolerances, together, tolerated
+from bodyschema.diagnosis.search.sets import CauseSets
+from bodyschema.diagnosis.search.together import (
+    _Linearisation,
+    alternatives_to_tolerances,
+    estimated_tolerances,
+    together,
+)
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
@@ -43,11 +48,11 @@ def fit_of(robot: RobotDescription, hidden: Effect, away_m: Sequence[float] = (0
     x = Simulation(robot, (hidden,)).positions(motion) + np.array(away_m)
     x += NOISE_M * np.random.default_rng(1).normal(size=x.shape)
     recording = measured(robot, motion, x)
-    return aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).tolerating(Scales())
+    return aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).with_tolerances(Scales())
 
 
-def sets(fit: Fit, cause: Effect) -> Sets:
-    return Sets(fit, [Candidate(cause, 0.0, 1)], 0.0)
+def sets(fit: Fit, cause: Effect) -> CauseSets:
+    return CauseSets(fit, [Candidate(cause, 0.0, 1)], 0.0)
 
 
 def test_set_worth_is_independent_of_reference_fit() -> None:
@@ -56,8 +61,8 @@ def test_set_worth_is_independent_of_reference_fit() -> None:
     without = fit_of(robot, hidden, (3.0, -3.0, 2.0))
     complete = without.with_causes([hidden])
     assert complete.noise.sigma < 0.5 * without.noise.sigma
-    worths = [sets(fit, hidden).of(()).worth for fit in (without, complete)]
-    assert worths[0] == pytest.approx(worths[1], abs=3.0)
+    net_evidences = [sets(fit, hidden).of(()).net_evidence for fit in (without, complete)]
+    assert net_evidences[0] == pytest.approx(net_evidences[1], abs=3.0)
 
 
 def test_outliers_explained_by_a_cause_favour_its_set() -> None:
@@ -65,15 +70,17 @@ def test_outliers_explained_by_a_cause_favour_its_set() -> None:
     jump = Effect.at(robot, "encoder_jump", ELBOW, values={"jump_rad": 0.1, "t0": 0.25 * (ROWS - 5.5)})
     without = fit_of(robot, jump)
     assert (without.noise.weights < 0.5).sum() == 6
-    assert sets(without.with_causes([jump]), jump).of((0,)).worth > sets(without, jump).of(()).worth + 20.0
+    assert (
+        sets(without.with_causes([jump]), jump).of((0,)).net_evidence > sets(without, jump).of(()).net_evidence + 20.0
+    )
 
 
 def test_cause_with_impossible_sign_leaves_its_set() -> None:
     robot = surveyed_arm()
     hidden = Effect.at(robot, "backlash", SHOULDER, values=[-0.02])
-    assert not hidden.is_possible
+    assert not hidden.is_valid
     compared = sets(fit_of(robot, hidden), hidden)
-    assert [one.chosen for one in compared.climbed([(0,)])] == [()]
+    assert [one.chosen for one in compared.hill_climbed([(0,)])] == [()]
 
 
 def rough(robot: RobotDescription, seed: int, angle: float, *causes: Effect) -> Fit:
@@ -94,10 +101,10 @@ def test_set_fit_recovers_from_too_large_tolerances(seed) -> None:
     offsets = [Effect.at(robot, "joint_offset", joint, values=[size]) for joint, size in places]
     start = rough(robot, seed, 5e-4, *offsets)
     hypotheses = [Effect.at(robot, "joint_offset", joint) for joint in robot.joints]
-    afar = _Place(start.tolerating(Scales(10.0, 10.0, 10.0)), hypotheses, ())
-    near = start.with_causes(offsets).tolerating(Scales()).tolerating(Scales())
-    again = afar.refitted(afar._sets.of(afar._sets.again(offsets)))
-    assert afar._worth(again) == pytest.approx(afar._worth(near), abs=3.0)
+    afar = _Linearisation(start.with_tolerances(Scales(10.0, 10.0, 10.0)), hypotheses, ())
+    near = start.with_causes(offsets).with_tolerances(Scales()).with_tolerances(Scales())
+    matching = afar.refitted(afar._sets.of(afar._sets.matching(offsets)))
+    assert afar._worth(matching) == pytest.approx(afar._worth(near), abs=3.0)
 
 
 @pytest.mark.parametrize(("bent", "stays"), [(0.0, False), (0.1, True)])
@@ -107,11 +114,13 @@ def test_only_strongly_bent_link_stays_in_rough_arm(seed, bent, stays) -> None:
     link = Effect.at(robot, "link_geometry", WRIST, values=[0.0, 0.0, 0.0, bent, -bent, bent])
     hypotheses = [Effect.at(robot, "link_geometry", joint) for joint in robot.joints]
     fit = (
-        rough(robot, seed, 5e-3, *([link] if bent else [])).tolerating(Scales()).with_causes([link.freeing((3, 4, 5))])
+        rough(robot, seed, 5e-3, *([link] if bent else []))
+        .with_tolerances(Scales())
+        .with_causes([link.with_free_amounts((3, 4, 5))])
     )
-    place = _Place(fit.tolerating(Scales()), hypotheses, ())
-    place = _Place(place.refitted(place.here), hypotheses, ())
-    assert (place.with_one_less() is None) is stays
+    place = _Linearisation(fit.with_tolerances(Scales()), hypotheses, ())
+    place = _Linearisation(place.refitted(place.current), hypotheses, ())
+    assert (place.without_weakest() is None) is stays
 
 
 @pytest.mark.parametrize(("arm", "angle"), [(desk_arm, 5e-3), (desk_arm, 8e-3), (surveyed_arm, 1e-3)])
@@ -138,8 +147,8 @@ def test_bent_link_is_named_over_implausible_tolerances(seed) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_alternative_to_large_tolerances_has_a_probability(seed) -> None:
     start, hypotheses = bent(seed, 0.008)
-    fit = start.tolerating(Scales())
-    found = in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses)
+    fit = start.with_tolerances(Scales())
+    found = alternatives_to_tolerances(fit.with_tolerances(estimated_tolerances(fit).scales), hypotheses)
     assert found[0][0].where == WRIST
     assert 0.1 < found[0][1] < 0.9
     assert all(share < 0.02 for _, share in found[1:])
@@ -157,16 +166,16 @@ def test_camera_scale_absorbed_by_tolerances_is_an_alternative() -> None:
     robot = desk_arm()
     start = rough(robot, 2, 3e-3, Effect.at(robot, "camera_scale", values=[0.02]))
     hypotheses = Hypotheses.of(start.simulation, start.observations).effects
-    fit = start.tolerating(Scales())
-    found = in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses)
+    fit = start.with_tolerances(Scales())
+    found = alternatives_to_tolerances(fit.with_tolerances(estimated_tolerances(fit).scales), hypotheses)
     assert found[0][0].name == "camera_scale"
     assert found[0][1] > 0.1  # the share from which a report leaves its verdict open
 
 
 def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:
     start, hypotheses = bent(1, 0.0)
-    fit = start.tolerating(Scales())
-    assert in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses) == []
+    fit = start.with_tolerances(Scales())
+    assert alternatives_to_tolerances(fit.with_tolerances(estimated_tolerances(fit).scales), hypotheses) == []
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3, 4])
@@ -190,26 +199,28 @@ def test_submillimetre_camera_displacement_is_found_despite_tolerances(seed) -> 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_refitted_set_has_self_consistent_tolerances(seed) -> None:
-    place = _Place(rough(desk_arm(), seed, 8e-3).tolerating(Scales()), [], ())
-    fit = place.refitted(place.here)
+    place = _Linearisation(rough(desk_arm(), seed, 8e-3).with_tolerances(Scales()), [], ())
+    fit = place.refitted(place.current)
     scales = fit.background.scales
     assert scales is not None
-    assert scales.angles == pytest.approx(tolerated(fit).scales.angles, rel=0.3)
+    assert scales.angles == pytest.approx(estimated_tolerances(fit).scales.angles, rel=0.3)
 
 
 def test_least_needed_cause_is_left_out(monkeypatch) -> None:
     robot = desk_arm()
     offsets = [Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, WRIST)]
-    place = _Place(rough(robot, 0, 1e-3, *offsets).tolerating(Scales()).with_causes(offsets), offsets, ())
+    place = _Linearisation(rough(robot, 0, 1e-3, *offsets).with_tolerances(Scales()).with_causes(offsets), offsets, ())
     gains = {ELBOW: 5.0, WRIST: 1.0}
-    monkeypatch.setattr(_Place, "_worth", lambda self, fit: self.here.worth + gains[fit.causes[0].where])
-    fewer = place.with_one_less()
+    monkeypatch.setattr(
+        _Linearisation, "_worth", lambda self, fit: self.current.net_evidence + gains[fit.causes[0].where]
+    )
+    fewer = place.without_weakest()
     assert fewer is not None
     assert [cause.where for cause in fewer.causes] == [ELBOW]
 
 
 @pytest.fixture(scope="module")
-def named() -> Sets:
+def named() -> CauseSets:
     """Return sets of zeros, ratios and links, each number of a link by itself, and jumps at one moment."""
     robot = surveyed_arm()
     names = ("joint_offset", "joint_scale", "link_geometry", "encoder_jump")
@@ -217,7 +228,7 @@ def named() -> Sets:
     links = [replace(one, free=(k,)) for one in effects if one.kind.in_parts for k in one.amounts]
     others = [one for one in effects if not one.kind.in_parts]
     fit = fit_of(robot, others[0])
-    return Sets(fit, [Candidate(one, 0.0, 1, 7 if one.kind.begins else 1) for one in (*others, *links)], 4.0)
+    return CauseSets(fit, [Candidate(one, 0.0, 1, 7 if one.kind.begins else 1) for one in (*others, *links)], 4.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -238,12 +249,12 @@ def test_the_names_of_a_set_have_no_order(named) -> None:
 
 
 def test_link_parameter_choices_have_total_probability_one() -> None:
-    ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
+    ways = choice_counts(Effect.at(desk_arm(), "link_geometry", BASE))
     assert (1.0 / ways[1:]).sum() == pytest.approx(1.0)
 
 
 def test_pure_shifts_are_likelier_than_mixed_link_parameters() -> None:
-    ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
+    ways = choice_counts(Effect.at(desk_arm(), "link_geometry", BASE))
     assert ways[0b000111] == ways[0b111000] < 0.1 * ways[0b100011]
 
 

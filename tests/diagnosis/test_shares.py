@@ -20,7 +20,7 @@ def divided() -> Shares:
     zero = Effect.at(robot, "joint_offset", SHOULDER, values=[0.03])
     scale = Effect.at(robot, "joint_scale", ELBOW, values=[0.005])
     start = start_of(robot, scattered(robot, 5, 120), (zero, scale), 5)
-    fit = start.with_causes([zero, scale]).tolerating(Scales()).settled()
+    fit = start.with_causes([zero, scale]).with_tolerances(Scales()).with_tolerances_applied()
     return shares(start, fit, np.ones(120, dtype=np.bool_), None)
 
 

@@ -9,7 +9,7 @@ import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, walk
 
 from bodyschema.diagnosis.assess.residual_structure import ResidualStructure
-from bodyschema.diagnosis.assess.stored import _Elsewhere, stored
+from bodyschema.diagnosis.assess.stored import _Generalisation, stored
 from bodyschema.diagnosis.diagnosis import _stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import BackgroundSettings, Scales
@@ -46,15 +46,15 @@ def test_a_joint_offset_is_stored(robot) -> None:
 
 def test_tolerances_fitted_to_drift_are_not_stored(robot) -> None:
     start = placed(robot, 0.05 * np.sin(np.linspace(0.0, 30.0, ROWS)))
-    large = start.tolerating(Scales(*[BackgroundSettings.largest_scale] * 3))
+    large = start.with_tolerances(Scales(*[BackgroundSettings.largest_scale] * 3))
     assert np.square(large.residuals).sum() < np.square(start.residuals).sum()
     assert stored([start, large], is_marker(large)) is start
 
 
 def test_written_model_is_aligned_to_all_rows(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
-    ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
-    for fit in (ignoring, ignoring.tolerating(Scales())):
+    ignoring = start.to(start.observations.ignoring(np.arange(ROWS) < ROWS // 2))
+    for fit in (ignoring, ignoring.with_tolerances(Scales())):
         # The camera may stand anywhere, so nothing is left of the mean of the rows by which it is placed.
         left = start.observations.x - fit.written.positions(start.observations.motion)
         np.testing.assert_allclose(left.mean(axis=0), 0.0, atol=1e-3 * SIGMA_M)
@@ -65,7 +65,7 @@ def test_written_model_is_aligned_between_marker_sides(robot) -> None:
     ways = start.run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
     beyond = np.where(np.arange(ROWS) // 10 % 3, 2e-3, -2e-3)[:, None] * ways
     loose = replace(start.observations, x=start.observations.x + beyond)
-    fit = start.to(loose.with_rattle(100.0, ways)).tolerating(Scales())
+    fit = start.to(loose.with_loose_marker(100.0, ways)).with_tolerances(Scales())
     left = loose.x - fit.written.positions(loose.motion)
     np.testing.assert_allclose(left.mean(axis=0), 0.0, atol=0.02 * SIGMA_M)
 
@@ -88,8 +88,10 @@ def test_tolerances_beside_gravity_loaded_marker_play_are_stored(robot, seed) ->
     x, ways = seen(motion)
     recording = measured(robot, motion, x + SIGMA_M * rng.normal(size=x.shape))
     observations, elsewhere = Observations.of(recording, Simulation(robot)), walk(robot, 100 + seed)
-    start = aligned(observations.whole, Simulation(robot))
-    loose = aligned(observations.with_rattle(100.0, ways), Simulation(robot)).tolerating(Scales(3.0, 3.0, 1.0))
+    start = aligned(observations.without_history, Simulation(robot))
+    loose = aligned(observations.with_loose_marker(100.0, ways), Simulation(robot)).with_tolerances(
+        Scales(3.0, 3.0, 1.0)
+    )
     assert stored([start, loose], is_marker(start)) is loose
     before, after = (np.square(fit.written.positions(elsewhere) - seen(elsewhere)[0]).sum() for fit in (start, loose))
     assert after < before
@@ -97,13 +99,13 @@ def test_tolerances_beside_gravity_loaded_marker_play_are_stored(robot, seed) ->
 
 def test_fallback_model_is_refitted_to_all_rows(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
-    ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
+    ignoring = start.to(start.observations.ignoring(np.arange(ROWS) < ROWS // 2))
     best = _stored(ignoring, ignoring, ignoring, ResidualStructure((), (), False, 1.0), Blocks.cut(ROWS))
     motion = start.observations.motion
-    half, whole = (
+    half, without_history = (
         np.abs(fit.simulation.positions(motion) - start.simulation.positions(motion)).max() for fit in (ignoring, best)
     )
-    assert whole < 0.05 * half
+    assert without_history < 0.05 * half
 
 
 def test_a_cause_that_explains_nothing_is_not_stored(robot) -> None:
@@ -119,5 +121,5 @@ def test_a_cause_that_explains_nothing_is_not_stored(robot) -> None:
 )
 def test_a_gain_that_is_not_sure_stores_nothing(robot, gains, variance) -> None:
     start = placed(robot, np.zeros(ROWS))
-    simpler = _Elsewhere(start, np.full(10, 20.0), 2.0)
-    assert not _Elsewhere(start, simpler.squares - gains, 2.0 + variance).is_better_than(simpler)
+    simpler = _Generalisation(start, np.full(10, 20.0), 2.0)
+    assert not _Generalisation(start, simpler.squares - gains, 2.0 + variance).is_better_than(simpler)

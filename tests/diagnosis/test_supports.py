@@ -36,7 +36,7 @@ def robot(tmp_path_factory) -> RobotDescription:
 def moments_about_the_floor(robot: RobotDescription, q: np.ndarray) -> np.ndarray:
     """Return the weight's moments (n, 3) [N·m]: the change of height of its centre as the floor is tilted."""
     moments, forces = Simulation(robot).gravity.loads(q)
-    (T, *_) = Simulation(robot).gravity.in_supports(0)
+    (T, *_) = Simulation(robot).gravity.in_support_frames(0)
     return moments[:, 0] @ T[:3, :3].T + np.cross(T[:3, 3], forces[:, 0] @ T[:3, :3].T)
 
 
@@ -58,7 +58,7 @@ def found(recording: Recording, robot: RobotDescription, only: tuple[str, ...] =
 def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed: int) -> Recording:
     """Return the positions with an upper arm that bends across its middle, in proportion to the moment there."""
     motion, k = walk(robot, seed), robot.joints.index(ELBOW)
-    run, (T, *_) = Simulation(robot).run(motion), Simulation(robot).gravity.in_supports(robot.joints.index(ELBOW))
+    run, (T, *_) = Simulation(robot).run(motion), Simulation(robot).gravity.in_support_frames(robot.joints.index(ELBOW))
     moments, forces = (load[:, k] for load in Simulation(robot).gravity.loads(motion.q))
     half = 0.5 * T[:3, 3] @ T[:3, :3]
     along = half / np.linalg.norm(half)
@@ -142,6 +142,6 @@ def test_possible_soft_mount_is_reported_with_a_check(robot) -> None:
 
 
 def test_supporting_frames_span_link_up_to_previous_joint(robot) -> None:
-    poses = Simulation(robot).gravity.in_supports(robot.joints.index(SHOULDER))
+    poses = Simulation(robot).gravity.in_support_frames(robot.joints.index(SHOULDER))
     assert len(poses) == 1
     np.testing.assert_allclose(poses[0][:3, 3], [0.03, 0.0, 0.06])

@@ -16,7 +16,7 @@ from bodyschema.diagnosis.report.result import (
     Tolerances,
     Unexplained,
 )
-from bodyschema.diagnosis.report.text import finding, made_to, sentence, to_do
+from bodyschema.diagnosis.report.text import actions, finding, sentence, tolerance_sentence
 
 SHIFT = {"x_m": 0.001, "y_m": 0.0, "z_m": 0.0}
 TURN = {"rx_rad": 0.0, "ry_rad": 0.01, "rz_rad": 0.0}
@@ -136,7 +136,7 @@ def test_prismatic_ripple_is_described_despite_unsure_pitch():
 
 def test_undetected_tolerances_are_reported_as_upper_bounds():
     size, none = Interval(0.3, (0.2, 0.4)), Interval(0.01, (0.0, 0.02))
-    assert made_to(Tolerances(size, none, none), "camera") == (
+    assert tolerance_sentence(Tolerances(size, none, none), "camera") == (
         "The arm is made to about 0.3 mm and at most 0.02°; its drives run true to at most ±0.02°."
     )
 
@@ -146,7 +146,7 @@ def test_alternatives_to_tolerances_appear_in_headline_and_details() -> None:
     link = Indistinguishable("link_geometry", "elbow", None, "this_motion", 0.3)
     rough = Tolerances(size, size, size, links_share_percent=90.0, rivals=(link,))
     beside = " Or the links are more exact than that, and there is a wrong link before joint elbow (30 %)."
-    assert made_to(rough, "camera").endswith(beside)
+    assert tolerance_sentence(rough, "camera").endswith(beside)
     errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
     said = [
         sentence("nothing_found", [], errors, gain, rough),
@@ -188,7 +188,7 @@ def test_improbable_small_causes_are_untabled_without_action() -> None:
     assert "elbow" in shown
     assert "joint_0" not in shown
     assert "2 corrections whose cause is not known" in shown
-    todo, small = to_do(file, ["turn the elbow", "turn joint_0", "turn joint_1"])
+    todo, small = actions(file, ["turn the elbow", "turn joint_0", "turn joint_1"])
     assert todo == ["turn the elbow"]
     assert [said.split(":")[0] for said in small] == [
         "Change nothing because of 2 corrections whose cause is not known"

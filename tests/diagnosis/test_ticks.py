@@ -10,7 +10,7 @@ from planted_cases import SIGMA_M, desk_arm, measured, walk
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
-from bodyschema.diagnosis.fit.observations import Observations, ticks
+from bodyschema.diagnosis.fit.observations import Observations, encoder_steps
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -31,22 +31,22 @@ def rounded(q: FloatArray, tick: float) -> FloatArray:
 
 @pytest.mark.parametrize("tick", [TICK_RAD, COARSE_RAD, np.radians(0.1)])
 def test_the_tick_of_rounded_readings_is_found(robot, tick) -> None:
-    np.testing.assert_allclose(ticks(rounded(walk(robot, 1).q, tick)), tick, rtol=1e-6)
+    np.testing.assert_allclose(encoder_steps(rounded(walk(robot, 1).q, tick)), tick, rtol=1e-6)
 
 
 def test_readings_that_are_not_rounded_have_no_tick(robot) -> None:
-    np.testing.assert_array_equal(ticks(walk(robot, 1).q), 0.0)
+    np.testing.assert_array_equal(encoder_steps(walk(robot, 1).q), 0.0)
 
 
 def test_each_joint_has_its_own_tick(robot) -> None:
     q = walk(robot, 1).q.copy()
     q[:, 1], q[:, 2] = rounded(q[:, 1], TICK_RAD), rounded(q[:, 2], COARSE_RAD)
-    np.testing.assert_allclose(ticks(q), [0.0, TICK_RAD, COARSE_RAD, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(encoder_steps(q), [0.0, TICK_RAD, COARSE_RAD, 0.0], rtol=1e-6)
 
 
 def test_joint_read_at_few_positions_has_no_tick(robot) -> None:
     q = np.repeat(rounded(walk(robot, 1).q[:15], TICK_RAD), 20, axis=0)
-    np.testing.assert_array_equal(ticks(q), 0.0)
+    np.testing.assert_array_equal(encoder_steps(q), 0.0)
 
 
 def noisy(robot: RobotDescription, factor: float, tick: float, seed: int) -> Observations:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, start_of, surveyed_arm, walk
 
-from bodyschema.diagnosis.assess.explanation import _is_told
+from bodyschema.diagnosis.assess.explanation import _is_worth_reporting
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
@@ -18,8 +18,8 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.sets import Sets
-from bodyschema.diagnosis.search.together import beyond_tolerances, tolerated
+from bodyschema.diagnosis.search.sets import CauseSets
+from bodyschema.diagnosis.search.together import estimated_tolerances, exceeds_tolerances
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription
@@ -124,7 +124,7 @@ def _with_small_tolerances(robot: RobotDescription) -> Fit:
     x = Simulation(robot, (offset,), None, made(robot, rng)).positions(motion_of(q))
     recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
     start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-    return start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
+    return start.with_causes([offset]).with_tolerances(Scales(0.5, 0.5, 0.5))
 
 
 def test_interval_includes_uncertainty_of_the_tolerances(robot: RobotDescription, monkeypatch) -> None:
@@ -148,11 +148,11 @@ def test_prismatic_ripple_is_tolerated_despite_exact_links(robot: RobotDescripti
     rng = np.random.default_rng(5)
     q = rng.uniform(robot.lower, robot.upper, (ROWS, len(robot.joints)))
     recording = measured(robot, motion_of(q), Simulation(robot).positions(motion_of(q)))
-    fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).tolerating(Scales(lengths=0.1))
+    fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).with_tolerances(Scales(lengths=0.1))
     ripple = Effect.at(robot, "joint_ripple", ELBOW, values=[5e-5, 0.0, 16.0])
-    assert fit.background.tolerates(replace(ripple, prismatic=True))
-    exact = fit.tolerating(Scales(slides=0.1))
-    assert not exact.background.tolerates(replace(ripple, prismatic=True))
+    assert fit.background.is_within_tolerance(replace(ripple, prismatic=True))
+    exact = fit.with_tolerances(Scales(slides=0.1))
+    assert not exact.background.is_within_tolerance(replace(ripple, prismatic=True))
 
 
 def test_background_survives_extended_toml_round_trip(robot: RobotDescription, tmp_path: Path) -> None:
@@ -182,9 +182,9 @@ def test_a_written_simulation_is_refitted_to_second_order() -> None:
         truth, motion = Simulation(robot, tuple(links)), scattered(robot, seed, ROWS)
         recording = measured(robot, motion, truth.positions(motion) + NOISE_M * rng.normal(size=(ROWS, 3)))
         start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-        fit = start.tolerating(Scales(10.0, 10.0, 1.0))
+        fit = start.with_tolerances(Scales(10.0, 10.0, 1.0))
         left += float(np.square(fit.written.positions(motion) - recording.x).sum())
-        first_order += float(np.square(fit.settled().predicted - recording.x).sum())
+        first_order += float(np.square(fit.with_tolerances_applied().predicted - recording.x).sum())
     assert left < 0.7 * first_order
 
 
@@ -197,8 +197,8 @@ def test_joint_scale_is_named_despite_absorbing_drive_errors(robot: RobotDescrip
     x = Simulation(robot, (ratio,), None, made(robot, rng)).positions(motion_of(q))
     recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
     start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-    fit = start.with_causes([ratio]).tolerating(Scales())
-    assert beyond_tolerances(fit, fit.causes[0], doubt=4.0)
+    fit = start.with_causes([ratio]).with_tolerances(Scales())
+    assert exceeds_tolerances(fit, fit.causes[0], naming_cost=4.0)
 
 
 @pytest.mark.parametrize(("size", "beyond"), [(7.0, False), (30.0, True)])
@@ -213,9 +213,9 @@ def test_two_offsets_that_need_each_other_are_tolerances(robot: RobotDescription
     x = Simulation(robot, tuple(offsets), None, tolerances).positions(motion_of(q))
     recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
     fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).with_causes(offsets)
-    fit = fit.tolerating(Scales())
-    fit = fit.tolerating(tolerated(fit).scales)
-    assert [beyond_tolerances(fit, cause, doubt=4.0) for cause in fit.causes] == [beyond, beyond]
+    fit = fit.with_tolerances(Scales())
+    fit = fit.with_tolerances(estimated_tolerances(fit).scales)
+    assert [exceeds_tolerances(fit, cause, naming_cost=4.0) for cause in fit.causes] == [beyond, beyond]
 
 
 def test_bounds_of_undetected_tolerances_scale_with_the_noise(robot: RobotDescription) -> None:
@@ -225,18 +225,18 @@ def test_bounds_of_undetected_tolerances_scale_with_the_noise(robot: RobotDescri
     for noise_m in (NOISE_M, 20.0 * NOISE_M):
         recording = measured(robot, motion_of(q), Simulation(robot).positions(motion_of(q)) + noise_m * noise)
         start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-        found.append(tolerated(start.tolerating(Scales())))
-    assert not any(one.seen.any() for one in found)
+        found.append(estimated_tolerances(start.with_tolerances(Scales())))
+    assert not any(one.is_detected.any() for one in found)
     # No joint slides.
-    quiet, noisy = (one.most[:3] for one in found)
+    quiet, noisy = (one.upper_limit[:3] for one in found)
     assert (noisy > 4.0 * quiet).all()
 
 
 def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:
     jump = Effect.at(robot, "encoder_jump", ELBOW, values={"jump_rad": 0.02, "t0": 12.0})
     start = start_of(robot, scattered(robot, 3, ROWS), (jump,), 3)
-    fit = start.with_causes([jump]).tolerating(Scales())
-    assert beyond_tolerances(fit, fit.causes[0], doubt=4.0) is None
+    fit = start.with_causes([jump]).with_tolerances(Scales())
+    assert exceeds_tolerances(fit, fit.causes[0], naming_cost=4.0) is None
 
 
 @pytest.mark.parametrize(
@@ -244,16 +244,19 @@ def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:
     [("link_geometry", 0.01, False), ("link_geometry", 0.4, True), ("joint_eccentricity", 0.01, True)],
 )
 def test_slight_gain_keeps_no_link_explained_by_tolerances(robot: RobotDescription, name, loss, told) -> None:
-    assert _is_told(Effect.at(robot, name, ELBOW), False, loss) is told
+    assert _is_worth_reporting(Effect.at(robot, name, ELBOW), False, loss) is told
 
 
 def test_link_costs_the_same_whole_or_by_parameter(robot: RobotDescription) -> None:
     link = Effect.at(robot, "link_geometry", ELBOW, values=[1e-3, 0.0, 0.0, 0.0, 0.02, 0.0])
-    fit = start_of(robot, scattered(robot, 3, ROWS), (link,), 3).tolerating(Scales())
+    fit = start_of(robot, scattered(robot, 3, ROWS), (link,), 3).with_tolerances(Scales())
     resting = link.with_values(np.zeros(6))
-    whole, numbers = resting.freeing((0, 1, 4)), [resting.freeing((number,)) for number in (0, 1, 4)]
-    at_once, in_parts = (Sets(fit, [Candidate(one, 0.0, 1) for one in some], 4.0) for some in ([whole], numbers))
-    assert at_once.of((0,)).worth == pytest.approx(in_parts.of((0, 1, 2)).worth, abs=1e-3)
+    whole, numbers = (
+        resting.with_free_amounts((0, 1, 4)),
+        [resting.with_free_amounts((number,)) for number in (0, 1, 4)],
+    )
+    at_once, in_parts = (CauseSets(fit, [Candidate(one, 0.0, 1) for one in some], 4.0) for some in ([whole], numbers))
+    assert at_once.of((0,)).net_evidence == pytest.approx(in_parts.of((0, 1, 2)).net_evidence, abs=1e-3)
 
 
 def test_intervals_are_independent_of_instrument_distance() -> None:
@@ -264,7 +267,7 @@ def test_intervals_are_independent_of_instrument_distance() -> None:
     for away_m in (0.0, 10.0):
         recording = measured(robot, motion, x + np.array([0.0, away_m, 0.0]))
         start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-        fit = start.with_causes([ratio]).tolerating(Scales())
+        fit = start.with_causes([ratio]).with_tolerances(Scales())
         widths.append(np.sqrt(np.diag(fit.covariance))[6:])
     np.testing.assert_allclose(widths[1], widths[0], rtol=0.02)
 

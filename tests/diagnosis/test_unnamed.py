@@ -104,10 +104,10 @@ def stored(diagnosis: Diagnosis, folder: Path) -> Simulation:
 
 def test_stored_model_corrects_another_path(robot, diagnosis, tmp_path) -> None:
     motion = walk(robot, 2)
-    left = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
+    unexplained = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
     learnt = walk(robot, 1, ROWS).q
     inside = np.abs(motion.q - np.median(learnt, axis=0)) < 0.4 * np.ptp(learnt, axis=0)
-    assert np.sqrt(np.square(left[inside.all(axis=1)]).sum(axis=1).mean()) < 0.5 * SIGMA_M * np.sqrt(3.0)
+    assert np.sqrt(np.square(unexplained[inside.all(axis=1)]).sum(axis=1).mean()) < 0.5 * SIGMA_M * np.sqrt(3.0)
 
 
 def test_rediagnosis_with_stored_model_finds_nothing(robot, diagnosis, tmp_path) -> None:
@@ -132,11 +132,11 @@ def test_time_drift_is_reported_as_outside_the_model(robot) -> None:
     noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape)
     nearest = ("joint_offset", "joint_scale", "encoder_jump", "thermal_drift", "tool_slip", "camera_moved")
     diagnosis = diagnose(measured(robot, motion, x + noise), Simulation(robot), only=nearest)
-    left = conclusion(diagnosis).unexplained
+    unexplained = conclusion(diagnosis).unexplained
     assert diagnosis.extended.simulation.residual is None
     assert diagnosis.causes == ()
-    assert (left.model_joints, left.not_in_model) == ((), left.what)
-    assert "What changes with time is in no such model" in modelled(left)
+    assert (unexplained.model_joints, unexplained.not_in_model) == ((), unexplained.what)
+    assert "What changes with time is in no such model" in modelled(unexplained)
 
 
 @pytest.mark.soak
@@ -193,7 +193,7 @@ def test_clock_drift_is_reported_beside_mean_latency(robot, seed) -> None:
     file = conclusion(diagnosis)
     assert file.verdict == "unexplained"
     assert [cause.effect for cause in file.causes] == ["camera_latency"]
-    assert diagnosis.left.what == ("the clocks of images and joints run apart",)
+    assert diagnosis.unexplained.what == ("the clocks of images and joints run apart",)
     assert file.rms_mm.noise_floor is not None
     assert file.rms_mm.noise_floor < 1.5e3 * SIGMA_M * np.sqrt(3.0)
 

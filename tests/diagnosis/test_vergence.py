@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.unnamed.vergence import by_turn, reported, undone
+from bodyschema.diagnosis.unnamed.vergence import by_turn, correct, reported
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.records import FloatArray
 
@@ -46,7 +46,7 @@ def test_vergence_report_matches_pixel_triangulation(turn) -> None:
 
 @given(TURNS)
 def test_vergence_report_is_invertible(turn) -> None:
-    np.testing.assert_allclose(undone(reported(points(), CALIBRATION, turn), CALIBRATION, turn), points(), atol=1e-6)
+    np.testing.assert_allclose(correct(reported(points(), CALIBRATION, turn), CALIBRATION, turn), points(), atol=1e-6)
 
 
 def test_derivatives_by_turns_are_those_of_small_turns() -> None:

@@ -14,7 +14,7 @@ from servo_arm import TICK
 from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.wiring.servos import SCANNERS
-from bodyschema.drivers.bench.device import Device, OnlyAnswers, Reply
+from bodyschema.drivers.bench.device import AnswerOnlyDevice, Device, Reply
 from bodyschema.drivers.dynamixel.bench.arm import swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
@@ -45,7 +45,7 @@ WEAK = {
 }
 
 
-class Wire(OnlyAnswers):
+class Wire(AnswerOnlyDevice):
     """A device whose answers are changed on the wire."""
 
     def __init__(self, device: Device, change: Change) -> None:

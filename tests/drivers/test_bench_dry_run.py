@@ -16,7 +16,7 @@ import pytest
 
 from bodyschema.drivers.bench.device import Reply
 from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.drivers.bench.faults import AskedFault, FaultKinds, WireFaults
+from bodyschema.drivers.bench.faults import FaultKinds, FaultSpec, WireFaults
 from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver
 from bodyschema.drivers.dynamixel.bench.arm import KINDS, DynamixelArm
@@ -81,7 +81,7 @@ POSE = (0.5, -0.25, 1.0)
 
 def standing(tmp_path: Path, make: str, *faults: str, config: Any = None, seed: int = 0) -> DryRun:
     arm_of, usual, kinds, _ = MAKES[make]
-    asked = [AskedFault.parsed(fault, JOINTS, kinds) for fault in faults]
+    asked = [FaultSpec.parsed(fault, JOINTS, kinds) for fault in faults]
     angles = {joint: lambda _, q=q: q for joint, q in zip(JOINTS, POSE, strict=True)}
     arm = arm_of(config or usual, angles, faults=asked, seed=seed)
     return DryRun(arm, {name: tmp_path / name for name in arm.devices}, faults=asked)
@@ -194,7 +194,7 @@ GAZING = msgspec.structs.replace(CONFIG, gaze=GazeConfig(joints=("waist", "shoul
 
 def turning(*faults: str) -> DynamixelArm:
     """Return an arm whose joints all move with time, except those that its servos turn."""
-    asked = [AskedFault.parsed(fault, JOINTS, KINDS) for fault in faults]
+    asked = [FaultSpec.parsed(fault, JOINTS, KINDS) for fault in faults]
     return DynamixelArm(GAZING, dict.fromkeys(JOINTS, lambda t: 0.1 * t), faults=asked, now=lambda: 2.0)
 
 
@@ -230,7 +230,7 @@ def test_a_turned_shaft_knows_where_it_was() -> None:
 def test_each_kind_can_be_asked_for(make, kind) -> None:
     kinds = MAKES[make][2]
     text = f"{kind}@elbow" if kind in kinds.of_one_joint else kind
-    assert AskedFault.parsed(text, JOINTS, kinds).kind == kind
+    assert FaultSpec.parsed(text, JOINTS, kinds).kind == kind
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_each_kind_can_be_asked_for(make, kind) -> None:
 )
 def test_invalid_fault_error_names_the_problem(text, said) -> None:
     with pytest.raises(ConfigError) as caught:
-        AskedFault.parsed(text, JOINTS, KINDS)
+        FaultSpec.parsed(text, JOINTS, KINDS)
     assert f"--fault {text}: " in str(caught.value)
     assert said in str(caught.value)
 

@@ -9,7 +9,7 @@ import pytest
 
 from bodyschema.drivers import checks
 from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.drivers.bench.faults import AskedFault
+from bodyschema.drivers.bench.faults import FaultSpec
 from bodyschema.drivers.checks import Check, holders, port_checks
 from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
@@ -146,7 +146,7 @@ class Told:
 
     def __init__(self, make: str, tmp_path: Path, *faults: str, delay_s: float = 0.0, read_s: float = 0.2) -> None:
         arm_of, config, the_make, open_port, *_ = MAKES[make]
-        asked = [AskedFault.parsed(fault, JOINTS, arm_of.kinds) for fault in faults]
+        asked = [FaultSpec.parsed(fault, JOINTS, arm_of.kinds) for fault in faults]
         self.arm = arm_of(config, dict.fromkeys(JOINTS, lambda _: 0.2), faults=asked, return_delay_s=delay_s)
         with DryRun(self.arm, {"arm": tmp_path / "bus"}) as bench:
             self.checks = list(servo_checks(the_make, bench.config, SystemClock(), open_port, read_s=read_s))

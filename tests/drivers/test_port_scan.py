@@ -11,7 +11,7 @@ import pytest
 from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.wiring.servos import SCANNERS
-from bodyschema.drivers.bench.device import Faults, OnlyAnswers, Reply, no_faults
+from bodyschema.drivers.bench.device import AnswerOnlyDevice, Faults, Reply, no_faults
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import Code, Error, instructions_in
@@ -38,7 +38,7 @@ def feetech(model: str, id: int, baud: int = 1_000_000, rad: float = 0.1) -> Fee
     return FeetechServo(FEETECH[model], id, lambda _: rad, baud=baud)
 
 
-class Cable(OnlyAnswers):
+class Cable(AnswerOnlyDevice):
     """Servos of both makes on one wire."""
 
     def __init__(self, servos: Sequence[Servo | FeetechServo], faults: Faults) -> None:

@@ -46,20 +46,22 @@ class Arm:
     def bus(self):
         return self.bench.bus("bench", RATE)
 
-    def fitted(self, id: int = 1):
-        return self.bench.fitted(self.bus, ServoConfig(f"joint{id}", id, self.models[id - 1].name), self.models[id - 1])
+    def identified_servo(self, id: int = 1):
+        return self.bench.identified_servo(
+            self.bus, ServoConfig(f"joint{id}", id, self.models[id - 1].name), self.models[id - 1]
+        )
 
-    def change(self, name: str, then: int, id: int = 1) -> Change:
-        servo = self.fitted(id)
+    def change(self, name: str, target: int, id: int = 1) -> Change:
+        servo = self.identified_servo(id)
         setting = {setting.name: setting for setting in self.bench.vendor.settings(servo.model)}[name]
-        return Change(servo, setting, self.bench.value(self.bus, servo, setting), then)
+        return Change(servo, setting, self.bench.value(self.bus, servo, setting), target)
 
 
 @pytest.mark.parametrize("models", ARMS)
 def test_a_number_is_written_and_read_back(models) -> None:
     arm = Arm(models)
     done = arm.bench.write(arm.bus, arm.change("return_delay", 0))
-    assert (done.outcome, done.found, done.said) == (Outcome.WRITTEN, 0, "")
+    assert (done.outcome, done.found, done.remarks) == (Outcome.WRITTEN, 0, "")
     assert (arm.chain.servo(1)["return_delay"], arm.chain.servo(2)["return_delay"]) == (0, 250)
 
 
@@ -74,8 +76,8 @@ def test_written_value_survives_a_power_cycle(models) -> None:
 @pytest.mark.parametrize("models", ARMS[2:])
 def test_the_eeprom_is_locked_again(models) -> None:
     arm = Arm(models)
-    for name, then in (("return_delay", 0), ("id", 9)):
-        assert arm.bench.write(arm.bus, arm.change(name, then)).said == ""
+    for name, target in (("return_delay", 0), ("id", 9)):
+        assert arm.bench.write(arm.bus, arm.change(name, target)).remarks == ""
     assert arm.chain.servo(9)["lock"] == 1
 
 
@@ -90,8 +92,8 @@ def test_servo_answers_at_its_new_id(models) -> None:
 def test_all_servos_answer_at_the_new_rate(models) -> None:
     arm = Arm(models)
     changes = [arm.change("baud", 0, id) for id in (1, 2)]
-    then = changes[0].setting.words["57600"]
-    changes = [replace(change, then=then) for change in changes]
+    target = changes[0].setting.words["57600"]
+    changes = [replace(change, target=target) for change in changes]
     done = arm.bench.write_bauds("bench", RATE, 57_600, changes)
     assert [one.outcome for one in done] == [Outcome.WRITTEN] * 2
     assert [servo.baud // 100 for servo in arm.chain.servos] in ([576, 576], [571, 571])
@@ -102,7 +104,7 @@ def test_servo_refusing_a_new_rate_keeps_the_old() -> None:
     arm.chain.servo(1)["torque"] = 1
     change = arm.change("baud", 1)
     (done,) = arm.bench.write_bauds("bench", RATE, 57_600, [change])
-    assert (done.outcome, done.said) == (Outcome.KEPT, "it still answers at 1,000,000 bit/s")
+    assert (done.outcome, done.remarks) == (Outcome.KEPT, "it still answers at 1,000,000 bit/s")
 
 
 def test_refused_write_is_reported_as_kept() -> None:
@@ -123,14 +125,14 @@ def test_lost_cable_after_write_gives_unknown_outcome(models) -> None:
     arm.chain.faults = cut
     done = arm.bench.write(arm.bus, change)
     assert (done.outcome, done.found) == (Outcome.UNKNOWN, None)
-    assert "no answer after it was written" in done.said
+    assert "no answer after it was written" in done.remarks
 
 
 @pytest.mark.parametrize("models", ARMS)
 def test_torque_is_off_before_anything_is_written(models) -> None:
     arm = Arm(models)
     arm.chain.servo(1)["torque"] = 1
-    arm.bench.torque_off(arm.bus, [arm.fitted()])
+    arm.bench.torque_off(arm.bus, [arm.identified_servo()])
     assert arm.chain.servo(1)["torque"] == 0
 
 
@@ -138,7 +140,7 @@ def test_torque_is_off_before_anything_is_written(models) -> None:
 @pytest.mark.parametrize("angle", [0.3, -0.9, 1.4])
 def test_homing_offset_makes_the_current_position_zero(models, angle) -> None:
     arm = Arm(models, angle)
-    servo = arm.fitted()
+    servo = arm.identified_servo()
     arm.bench.write(arm.bus, arm.change("homing_offset", arm.bench.homing_offset(arm.bus, servo)))
     assert arm.bench.position(arm.bus, servo) == servo.zero_ticks
 
@@ -147,7 +149,7 @@ def test_servo_of_another_model_is_not_written() -> None:
     arm = Arm()
     wrong = DYNAMIXELS["XM540-W270"]
     with pytest.raises(SourceError, match=r"XM430-W350: wrong model.*nothing was written"):
-        arm.bench.fitted(arm.bus, ServoConfig("joint1", 1, wrong.name), wrong)
+        arm.bench.identified_servo(arm.bus, ServoConfig("joint1", 1, wrong.name), wrong)
 
 
 @pytest.mark.parametrize("models", ARMS)
@@ -157,11 +159,11 @@ def test_unlisted_servo_reports_its_model(models) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("255", "from 0 to 254"), ("-1", "from 0 to 254"), ("much", "from 0 to 254")]
+    ("text", "remarks"), [("255", "from 0 to 254"), ("-1", "from 0 to 254"), ("much", "from 0 to 254")]
 )
-def test_out_of_range_value_error_states_the_range(text, said) -> None:
+def test_out_of_range_value_error_states_the_range(text, remarks) -> None:
     (delay,) = [setting for setting in settings_of(DYNAMIXELS["XM430-W350"]) if setting.name == "return_delay"]
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=remarks):
         delay.value(text)
 
 

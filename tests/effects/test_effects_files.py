@@ -85,7 +85,9 @@ def test_second_extension_keeps_effects_of_the_first(robot, tmp_path) -> None:
 
 def test_two_ripples_of_one_joint_round_trip(robot, tmp_path) -> None:
     ripples = [Effect.at(robot, "joint_ripple", "elbow", values=[0.001, 0.0, cycles]) for cycles in (9.0, 14.0)]
-    again = load_simulation(write_extended(Simulation(robot, (ripples[0], ripples[1].one_more(1))), tmp_path, HEADING))
+    again = load_simulation(
+        write_extended(Simulation(robot, (ripples[0], ripples[1].with_ordinal(1))), tmp_path, HEADING)
+    )
     assert [effect.value("cycles_per_turn") for effect in again.effects] == [9.0, 14.0]
     assert len({effect.identity for effect in again.effects}) == 2
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.effects import EFFECT_TYPES, Effect, LiveEncoders, Motion, Simulation
-from bodyschema.effects.catalogue.backlash import played
+from bodyschema.effects.catalogue.backlash import follow_backlash
 from bodyschema.effects.encoder import EncoderEffect
 
 PATHS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
@@ -24,24 +24,24 @@ def robot(tmp_path_factory):
 
 @given(PATHS, WIDTHS)
 def test_backlash_lag_never_exceeds_half_its_width(q, width) -> None:
-    assert np.abs(played(q, width)).max() <= 0.5 * width + 1e-12  # of readings around 1
+    assert np.abs(follow_backlash(q, width)).max() <= 0.5 * width + 1e-12  # of readings around 1
 
 
 @given(PATHS, WIDTHS)
 def test_backlash_output_moves_only_with_its_input(q, width) -> None:
-    output = q + played(q, width)
+    output = q + follow_backlash(q, width)
     assert (np.diff(output) * np.diff(q) >= -1e-15).all()
 
 
 @given(st.lists(st.floats(0.01, 0.1), min_size=2, max_size=40), WIDTHS)
 def test_one_way_motion_lags_by_half_backlash_width(steps, width) -> None:
     q = np.cumsum(steps)
-    np.testing.assert_allclose(played(q, width), -0.5 * width, atol=1e-12)
+    np.testing.assert_allclose(follow_backlash(q, width), -0.5 * width, atol=1e-12)
 
 
 def test_backlash_output_rests_until_width_is_crossed() -> None:
     q = np.array([0.0, 0.1, 0.08, 0.05, 0.0])
-    output = q + played(q, 0.04)
+    output = q + follow_backlash(q, 0.04)
     np.testing.assert_allclose(output, [-0.02, 0.08, 0.08, 0.07, 0.02], atol=1e-15)
 
 

@@ -20,7 +20,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.session import Request, ZenohSession
 from bodyschema.daemon.transport.status import JointRange, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
-from bodyschema.fleet.comparison import Model, common_poses, compared, sentences
+from bodyschema.fleet.comparison import Model, common_poses, compare_models, sentences
 from bodyschema.fleet.roster import Fleet, places
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import FloatArray
@@ -97,7 +97,7 @@ def fleet(*words: str) -> None:
 
 def test_robots_are_found_with_both_states(endpoint: str) -> None:
     with robots(endpoint, {"left": 0.0, "right": 0.0, "spare": 0.0}), Fleet(places([endpoint], [])) as found:
-        members = found.look()
+        members = found.poll()
     assert [member.name for member in members] == ["left", "right", "spare"]
     assert all(member.sampler is not None and member.learner is not None for member in members)
     assert members[0].error_m == 0.002
@@ -125,8 +125,8 @@ def test_absent_described_robot_is_listed(tmp_path: Path, free_endpoint: Callabl
     here, elsewhere = free_endpoint(), free_endpoint()
     file = write_small_arm(tmp_path, f'[zenoh]\nsampler = "{elsewhere}"\nlearner = "{here}"\n')
     with robots(here, {"left": 0.0}), Fleet(places([], [file])) as found:
-        members = {member.name: member for member in found.look()}
-        assert f"nothing listens on {elsewhere}" in found.unreached[0]
+        members = {member.name: member for member in found.poll()}
+        assert f"nothing listens on {elsewhere}" in found.unreachable[0]
     assert members["arm"].health == ["neither its sampler nor its learner is alive"]
     assert members["left"].alive == {"sampler", "learner"}
 
@@ -178,7 +178,7 @@ def q() -> FloatArray:
 
 def test_where_the_camera_stands_makes_no_robot_odd(q: FloatArray) -> None:
     turns = Rotation.random(5, random_state=1)
-    found = compared(JOINTS, q, [model("m" * k, q, 0.0, turn) for k, turn in enumerate(turns, 1)])
+    found = compare_models(JOINTS, q, [model("m" * k, q, 0.0, turn) for k, turn in enumerate(turns, 1)])
     assert [unit.is_off for unit in found.units] == [False] * 5
     assert max(unit.apart.rms_mm for unit in found.units) < 0.3
 
@@ -186,24 +186,24 @@ def test_where_the_camera_stands_makes_no_robot_odd(q: FloatArray) -> None:
 @pytest.mark.parametrize("robots", [3, 4, 10])
 def test_one_odd_robot_does_not_shift_the_median(q: FloatArray, robots: int) -> None:
     models = [model("m" * k, q, 0.05 if k == 2 else 0.0) for k in range(1, robots + 1)]
-    found = compared(JOINTS, q, models)
+    found = compare_models(JOINTS, q, models)
     assert [unit.robot for unit in found.units if unit.is_off] == ["mm"]
 
 
 def test_two_robots_have_no_odd_one(q: FloatArray) -> None:
-    found = compared(JOINTS, q, [model("m", q, 0.0), model("mm", q, 0.05)])
+    found = compare_models(JOINTS, q, [model("m", q, 0.0), model("mm", q, 0.05)])
     assert [unit.is_off for unit in found.units] == [None, None]
     assert "not possible to say which" in sentences(found)[-1]
 
 
 def test_only_the_figure_that_differs_stands_out(q: FloatArray) -> None:
-    found = compared(JOINTS, q, [model("m" * k, q, 0.05 if k == 1 else 0.0) for k in range(1, 6)])
+    found = compare_models(JOINTS, q, [model("m" * k, q, 0.05 if k == 1 else 0.0) for k in range(1, 6)])
     assert [[odd.figure for odd in unit.odd] for unit in found.units] == [["zero of waist"], [], [], [], []]
 
 
 def test_common_joint_offset_does_not_stand_out(q: FloatArray) -> None:
     waists = [-0.05, -0.02, 0.0, 0.03, 0.06]
-    found = compared(JOINTS, q, [model("m" * k, q, waist) for k, waist in enumerate(waists, 1)])
+    found = compare_models(JOINTS, q, [model("m" * k, q, waist) for k, waist in enumerate(waists, 1)])
     assert [unit.odd for unit in found.units] == [()] * 5
 
 

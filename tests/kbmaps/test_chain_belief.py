@@ -132,7 +132,7 @@ def test_mixed_belief_covariance_includes_distance_between_means():
         ChainBelief(parameters, mean, 0.01 * rng.normal(size=(parameters.size, 5)))
         for mean in 0.01 * rng.normal(size=(2, parameters.size))
     )
-    found = near.among([near, far], [0.75, 0.25])
+    found = near.with_mixture_covariance([near, far], [0.75, 0.25])
     apart = far.mean - near.mean
     expected = 0.75 * near.covariance + 0.25 * (far.covariance + np.outer(apart, apart))
     np.testing.assert_allclose(found.covariance, expected, atol=1e-12)

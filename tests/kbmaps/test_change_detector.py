@@ -77,7 +77,7 @@ class Arm:
         detector = self.detector()
         for k in range(len(self.q)):
             self.feed(detector, slice(k, k + 1))
-            if detector.suspicion().alarm:
+            if detector.change_score().alarm:
                 return detector, k + 1
         raise AssertionError("no alarm")
 
@@ -88,7 +88,7 @@ def test_large_change_is_dated_within_ten_pairs(seed: int, kind: str) -> None:
     arm = Arm(seed)
     arm.change(kind, 10.0 * SIGMA)
     detector, pairs = arm.noticed()
-    earliest, latest = detector.suspicion().interval()
+    earliest, latest = detector.change_score().interval()
     assert BEFORE < pairs <= BEFORE + 10
     assert earliest - 2 <= BEFORE <= latest + 2
 
@@ -134,7 +134,7 @@ def test_without_a_change_there_is_no_alarm(seed: int) -> None:
     detector = arm.detector()
     for k in range(0, 400, 10):
         arm.feed(detector, slice(k, k + 10))
-        assert not detector.suspicion().alarm
+        assert not detector.change_score().alarm
 
 
 def test_mean_likelihood_ratio_is_one_without_a_change() -> None:
@@ -151,7 +151,7 @@ def test_two_consecutive_gross_outliers_raise_no_alarm() -> None:
     arm.x[BEFORE : BEFORE + 2] += 1.0
     detector = arm.detector()
     arm.feed(detector, slice(BEFORE + 2))
-    assert not detector.suspicion().alarm
+    assert not detector.change_score().alarm
 
 
 def test_noise_that_has_doubled_is_no_change() -> None:
@@ -160,7 +160,7 @@ def test_noise_that_has_doubled_is_no_change() -> None:
     detector = arm.detector()
     for k in range(0, 400, 10):
         arm.feed(detector, slice(k, k + 10))
-        assert not detector.suspicion().alarm
+        assert not detector.change_score().alarm
 
 
 def test_shared_neighbour_errors_raise_the_variance_of_runs() -> None:
@@ -176,8 +176,8 @@ def alarms(arm: Arm, every: int) -> Iterator[tuple[int, bool]]:
     detector = arm.detector()
     for k in range(0, len(arm.q), every):
         arm.feed(detector, slice(k, k + every))
-        if detector.suspicion().alarm:
-            yield k + every, detector.suspicion_if_it_bends().alarm
+        if detector.change_score().alarm:
+            yield k + every, detector.score_if_bending().alarm
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -204,10 +204,10 @@ def test_earlier_rigid_behaviour_raises_the_odds_of_change(seed: int) -> None:
     arm.change("tool", 2.0 * SIGMA)
     unaware, aware = arm.detector(), arm.detector()
     off = earlier.x - earlier.parameters.positions(earlier.truth, earlier.q)
-    aware.recall(earlier.q, off, isotropic(SIGMA, len(off)))
+    aware.set_fitted_pairs(earlier.q, off, isotropic(SIGMA, len(off)))
     for detector in (unaware, aware):
         arm.feed(detector, slice(None))
-    assert aware.suspicion_if_it_bends().log_odds > unaware.suspicion_if_it_bends().log_odds
+    assert aware.score_if_bending().log_odds > unaware.score_if_bending().log_odds
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
@@ -217,9 +217,9 @@ def test_change_of_compliant_arm_is_detected_and_dated(seed: int) -> None:
     arm.change("tool", 10.0 * SIGMA)
     detector = arm.detector()
     arm.feed(detector, slice(BEFORE + 6))
-    suspicion = detector.suspicion_if_it_bends()
-    assert suspicion.alarm
-    assert abs(suspicion.onset - BEFORE) <= 1
+    change_score = detector.score_if_bending()
+    assert change_score.alarm
+    assert abs(change_score.onset - BEFORE) <= 1
 
 
 def test_errors_that_the_axes_share_count_once() -> None:
@@ -230,7 +230,7 @@ def test_errors_that_the_axes_share_count_once() -> None:
     error = 6.0 * SIGMA * along
     turned.add(arm.q[:1], error[None], covariances[:1])
     plain.add(arm.q[:1], np.array([[2.0 * SIGMA, 0.0, 0.0]]), isotropic(SIGMA, 1))
-    lengths = [float(np.linalg.norm(each.surprises)) for each in (turned, plain)]
+    lengths = [float(np.linalg.norm(each.whitened_errors)) for each in (turned, plain)]
     assert lengths[0] == pytest.approx(lengths[1], rel=0.2)
 
 
@@ -250,7 +250,7 @@ def test_the_number_of_kept_errors_is_bounded(monkeypatch: pytest.MonkeyPatch) -
     arm = Arm(0)
     detector = arm.detector()
     arm.feed(detector, slice(None))
-    assert detector.surprises.shape == (100, 3)
+    assert detector.whitened_errors.shape == (100, 3)
 
 
 def test_batched_pairs_give_same_odds_as_single_pairs() -> None:
@@ -258,7 +258,7 @@ def test_batched_pairs_give_same_odds_as_single_pairs() -> None:
     arm.feed(all_, slice(50))
     for k in range(50):
         arm.feed(one, slice(k, k + 1))
-    assert one.suspicion().log_odds == pytest.approx(all_.suspicion().log_odds)
+    assert one.change_score().log_odds == pytest.approx(all_.change_score().log_odds)
 
 
 @pytest.mark.parametrize("sigma_m", [1e-3, 1e-6, 1e-9])
@@ -268,8 +268,8 @@ def test_thousands_of_exact_pairs_keep_detector_finite(sigma_m) -> None:
     arm.x = arm.parameters.positions(arm.truth, arm.q)
     detector = ChangeDetector(arm.belief, SharedNoise(np.ones(1), 1.0), sigma_m, 0.5)
     detector.add(arm.q, arm.x - arm.belief.predict(arm.q), isotropic(sigma_m, len(arm.x)))
-    assert np.isfinite(detector.surprises).all()
-    assert np.isfinite(detector.suspicion().log_odds)
+    assert np.isfinite(detector.whitened_errors).all()
+    assert np.isfinite(detector.change_score().log_odds)
 
 
 def test_zero_residuals_have_a_positive_finite_variance() -> None:

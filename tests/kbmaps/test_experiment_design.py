@@ -24,7 +24,7 @@ seeds = st.integers(0, 2**32 - 1)
 LOST = ChainTolerances(ROUGH.axes, ROUGH.points, tool=ROUGH.tool, base_rotation=3.0, base_translation=3.0)
 
 
-class Waves:
+class ContourSpectrum:
     """A linear model of two joints: x = B(q) w with a few sines, weights w from N(0, root rootᵀ)."""
 
     joints = 2
@@ -51,7 +51,7 @@ class Waves:
 
 def planted(seed, floor=0.0):
     rng = np.random.default_rng(seed)
-    return Waves(rng, floor=floor), rng.uniform(-2, 2, (20, 2)), rng.uniform(-2, 2, (15, 2))
+    return ContourSpectrum(rng, floor=floor), rng.uniform(-2, 2, (20, 2)), rng.uniform(-2, 2, (15, 2))
 
 
 @given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kbmaps.arrays import FloatArray
-from kbmaps.variance_components import error_covariances, tells_directions
+from kbmaps.variance_components import error_covariances, is_anisotropic
 
 PAIRS = 400
 
@@ -66,7 +66,7 @@ def test_a_covariance_of_zeros_counts_as_missing() -> None:
     "stated", [np.full((PAIRS, 3, 3), np.nan), np.zeros((PAIRS, 3, 3)), np.tile(np.eye(3), (PAIRS, 1, 1))]
 )
 def test_missing_or_isotropic_covariances_tell_no_directions(stated: FloatArray) -> None:
-    assert not tells_directions(np.broadcast_to(stated, (PAIRS, 3, 3)))
+    assert not is_anisotropic(np.broadcast_to(stated, (PAIRS, 3, 3)))
 
 
 def test_errors_of_rounding_alone_have_covariances() -> None:

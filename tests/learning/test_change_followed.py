@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.changes.known_arm import KnownArm, Origin
+from bodyschema.learning.changes.known_arm import ArmBeforeChange, KnownArm
 from bodyschema.learning.changes.monitor import DetectedChange, Reference
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import chain_tolerances
@@ -66,16 +66,16 @@ class Followed:
         rng = np.random.default_rng(5)
         before, q = built_chain(rng), path(rng, TAUGHT + SINCE)
         after = CHANGES[kind](before)
-        learning, noticed = new_learning(settings=LearnerConfig(replays_per_pair=0.0)), 0
+        learning, detected = new_learning(settings=LearnerConfig(replays_per_pair=0.0)), 0
         teach(learning, measured(before, q[:TAUGHT], rng, sigma_m=SIGMA), every=NOW_AND_THEN)
         assert learning.counters.changes == 0
         for pair in measured(after, q[TAUGHT:], rng, first=TAUGHT + 1, sigma_m=SIGMA):
             teach(learning, [pair], background=pair.seq % NOW_AND_THEN == 0)
-            if learning.counters.changes and not noticed:
-                noticed = pair.seq
+            if learning.counters.changes and not detected:
+                detected = pair.seq
         while learning.work():
             pass
-        return cls(kind, learning, before, after, q, noticed)
+        return cls(kind, learning, before, after, q, detected)
 
     def error_m(self, chain: RigidChain) -> float:
         return Scene(chain, self.q[TAUGHT:], []).error_m(self.learning)
@@ -182,9 +182,9 @@ def test_old_model_is_replaced_only_by_better_one(moved_m: float) -> None:
     kinds, turns = change_kinds(parameters, 1.0), np.full((20, 4), np.nan)
     seqs, kept = tuple(range(1, 21)), (True,) * 20
     cov = np.full((20, 3, 3), np.nan)
-    noticed = DetectedChange(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, cov, turns)
-    origin = Origin(noticed, KnownArm(belief, tolerances))
-    assert origin.is_better(origin.explain(q, x), q, x) == (moved_m > 0.0)
+    detected = DetectedChange(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, cov, turns)
+    origin = ArmBeforeChange(detected, KnownArm(belief, tolerances))
+    assert origin.improves_prediction(origin.explain(q, x), q, x) == (moved_m > 0.0)
 
 
 def test_changed_arm_is_unknown_until_solver_has_pairs() -> None:

@@ -20,7 +20,7 @@ def test_monitor_keeps_bounded_pairs_without_a_model() -> None:
         watch.add(
             Pair("simulated", seq, 1, 0.0, "", frozen_array(np.zeros(2)), frozen_array(np.zeros(3)), cov), kept=True
         )
-    assert 0 < watch.held <= MonitorSettings.most_watched
+    assert 0 < watch.monitored_count <= MonitorSettings.most_watched
 
 
 @pytest.mark.parametrize(

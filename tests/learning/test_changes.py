@@ -49,7 +49,7 @@ def test_change_is_logged_once_detected_and_once_named(changes: Changes, caplog)
 
 
 def test_announced_change_is_logged_as_announced(changes: Changes, caplog) -> None:
-    changes.note(ChangeRecord.told(20))
+    changes.note(ChangeRecord.reported(20))
     assert logged(caplog) == ["tool changed before pair 21, as reported by the command tool_changed"]
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.learning.changes.outlier_gate import explained
+from bodyschema.learning.changes.outlier_gate import is_explained
 
 
 @pytest.mark.parametrize(
@@ -18,4 +18,4 @@ def test_outlier_run_is_explained_by_small_remaining_error(
     before_mm: float, after_mm: float, expected_mm: float, answer: bool
 ) -> None:
     before, after = np.full(3, 1e-3 * before_mm), np.full(3, 1e-3 * after_mm)
-    assert explained(before, after, 1e-3 * expected_mm) is answer
+    assert is_explained(before, after, 1e-3 * expected_mm) is answer

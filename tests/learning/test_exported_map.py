@@ -28,51 +28,51 @@ def map_off_by(metres: float) -> KBMap:
     return SCENE.chain.with_tool([metres, 0.0, 0.0]).to_kbmap(NOMINAL.bases)
 
 
-def beside(era: Regime) -> str:
+def beside(regime: Regime) -> str:
     """Return the name of the published map."""
-    return next(name for name, kbmap in era.models.maps.items() if kbmap is era.map)
+    return next(name for name, kbmap in regime.models.maps.items() if kbmap is regime.map)
 
 
-def take(era: Regime, name: str, model: LearntModel) -> None:
+def take(regime: Regime, name: str, model: LearntModel) -> None:
     """Give the regime a solution of all pairs up to now."""
-    pairs = era.memory.count
-    era.ask()
-    era.take(Solved(era.task_number, pairs, name, model), model, pairs)
+    pairs = regime.memory.count
+    regime.request_solution()
+    regime.take(Solved(regime.task_number, pairs, name, model), model, pairs)
 
 
-def learn(era: Regime, part: slice) -> None:
+def learn(regime: Regime, part: slice) -> None:
     for pair in SCENE.pairs[part]:
-        era.learn(pair)
+        regime.learn(pair)
 
 
 @pytest.fixture
-def era() -> Regime:
+def regime() -> Regime:
     """Return a regime with a chain and residual models; the rigid chain's map is the best of the maps."""
     arm = KnownArm(BELIEF, TOLERANCES)
-    era = Regime(NOMINAL.prior, arm, UncertaintyTracker(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
-    learn(era, slice(0, 20))
+    regime = Regime(NOMINAL.prior, arm, UncertaintyTracker(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
+    learn(regime, slice(0, 20))
     residual = fitted_residual(BELIEF, SCENE.q, X)
     assert residual is not None
-    take(era, RIGID, map_off_by(0.004))
-    take(era, RESIDUAL, residual)
-    learn(era, slice(20, 40))
-    return era
+    take(regime, RIGID, map_off_by(0.004))
+    take(regime, RESIDUAL, residual)
+    learn(regime, slice(20, 40))
+    return regime
 
 
-def test_best_map_is_exported_while_residual_model_answers(era: Regime) -> None:
-    assert (era.answering, beside(era)) == (RESIDUAL, RIGID)
+def test_best_map_is_exported_while_residual_model_answers(regime: Regime) -> None:
+    assert (regime.answering, beside(regime)) == (RESIDUAL, RIGID)
 
 
-def test_it_becomes_another_one_when_that_predicts_better(era: Regime) -> None:
-    take(era, EXACT, map_off_by(0.001))
-    learn(era, slice(40, 60))
-    assert (era.answering, beside(era)) == (RESIDUAL, EXACT)
+def test_it_becomes_another_one_when_that_predicts_better(regime: Regime) -> None:
+    take(regime, EXACT, map_off_by(0.001))
+    learn(regime, slice(40, 60))
+    assert (regime.answering, beside(regime)) == (RESIDUAL, EXACT)
 
 
-def test_fitted_prior_is_exported_after_comparison_pairs_removed(era: Regime) -> None:
+def test_fitted_prior_is_exported_after_comparison_pairs_removed(regime: Regime) -> None:
     old_tool = make_pair(41, SCENE.q[0], X[0] + 0.2)
-    era.begin_with(old_tool.q[None], old_tool.x[None])
+    regime.learn_former_outliers(old_tool.q[None], old_tool.x[None])
     fitted = map_off_by(0.0)
-    doubted = era.set_aside(fitted)
-    era.change_prior(fitted)
-    assert (doubted, beside(era)) == (1, PRIOR)
+    doubted = regime.drop_outliers(fitted)
+    regime.change_prior(fitted)
+    assert (doubted, beside(regime)) == (1, PRIOR)

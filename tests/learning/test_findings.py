@@ -12,16 +12,16 @@ from scipy.spatial.transform import Rotation
 from test_calibration import DESK_ARM, figures_of
 
 import bodyschema.daemon.learner.findings
-from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
+from bodyschema.calibration.chain_figures import ChainFigures, limited_to_exact_pairs, tolerances_determined
 from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
-from bodyschema.daemon.learner.findings import Findings, FindingTurns, _Settings, figures
+from bodyschema.daemon.learner.findings import Findings, FindingsBudget, _Settings, figures
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
+from bodyschema.learning.data_outlook import LearnerEvidence, ResidualScatter, forecast
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import DirectSolver
-from bodyschema.learning.status import Outlook
+from bodyschema.learning.status import DataOutlook
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances
 
@@ -116,7 +116,7 @@ def shared(seed: int, pairs: int) -> Planted:
 
 def findings_of(arm: Planted, clock: Ticking | None = None) -> Findings:
     clock = clock or Ticking()
-    return Findings(arm.learning, arm.robot, clock, turns=FindingTurns(clock.now))
+    return Findings(arm.learning, arm.robot, clock, budget=FindingsBudget(clock.now))
 
 
 # --- calibration
@@ -156,7 +156,7 @@ def test_freeing_unidentifiable_parameters_keeps_all_positions(retooled) -> None
     arm = retooled[1]
     known = arm.known()
     prior = known.nominal.belief(known.belief.parameters.reference, known.tolerances)
-    freed = no_surer_than_possible(known.belief, prior, arm.robot)
+    freed = limited_to_exact_pairs(known.belief, prior, arm.robot)
     q = np.random.default_rng(9).uniform(arm.robot.lower, arm.robot.upper, (50, 4))
     np.testing.assert_allclose(freed.predict(q), known.belief.predict(q), rtol=0, atol=0.02 * SIGMA_M)
 
@@ -193,11 +193,11 @@ def test_hand_eye_covariance_matches_camera_intervals() -> None:
     _, pitch, yaw = (figure.learnt for figure in found.camera_rpy)
     about_z = Rotation.from_euler("z", yaw)
     # Columns: the turns about the parent's axes by a step in roll, pitch and yaw.
-    turns = np.column_stack(
+    budget = np.column_stack(
         [(about_z * Rotation.from_euler("y", pitch)).apply([1.0, 0.0, 0.0]), about_z.apply([0.0, 1.0, 0.0]), [0, 0, 1]]
     )
     to_figures = np.zeros((6, 6))
-    to_figures[:3, :3], to_figures[3:, 3:] = np.eye(3), np.linalg.inv(turns)
+    to_figures[:3, :3], to_figures[3:, 3:] = np.eye(3), np.linalg.inv(budget)
     variances = np.diag(to_figures @ np.reshape(found.hand_eye.covariance, (6, 6)) @ to_figures.T)
     expected = [figure.half_width for figure in (*found.camera_xyz, *found.camera_rpy)]
     assert 1.96 * np.sqrt(variances) == pytest.approx(expected, rel=1e-3)
@@ -220,16 +220,16 @@ def test_joint_offset_intervals_survive_a_tool_change(retooled) -> None:
 
 
 def test_the_noise_is_the_scatter_of_the_pairs() -> None:
-    assert Scatter.of(shared(2, 60).known()).noise_m == pytest.approx(SIGMA_M, rel=0.15)
+    assert ResidualScatter.of(shared(2, 60).known()).noise_m == pytest.approx(SIGMA_M, rel=0.15)
 
 
 # --- outlook
 
 
-def outlook_of(learning: OnlineLearner) -> Outlook:
+def outlook_of(learning: OnlineLearner) -> DataOutlook:
     known = learning.known()
     assert known is not None
-    return forecast(known, Scatter.of(known), NAMES)
+    return forecast(known, ResidualScatter.of(known), NAMES)
 
 
 def guided(seed: int, pairs: int) -> tuple[OnlineLearner, Scene]:
@@ -239,7 +239,7 @@ def guided(seed: int, pairs: int) -> tuple[OnlineLearner, Scene]:
 
 
 @pytest.fixture(scope="module")
-def after_60() -> list[tuple[OnlineLearner, Scene, Outlook]]:
+def after_60() -> list[tuple[OnlineLearner, Scene, DataOutlook]]:
     """Return learners that know the first 60 pairs of a path of 160, and their outlook then."""
     found = []
     for seed in range(2):
@@ -332,7 +332,7 @@ def test_findings_renew_with_new_chain_after_the_interval() -> None:
 def test_wall_time_without_cpu_time_delays_no_findings() -> None:
     arm, clock = Planted.of(1, FEW), Slow()
     clock.TICK_S = 60.0  # a minute passes on a busy machine, and the finding takes no time of the processor
-    findings = Findings(arm.learning, arm.robot, clock, turns=FindingTurns(lambda: 0.0))
+    findings = Findings(arm.learning, arm.robot, clock, budget=FindingsBudget(lambda: 0.0))
     findings.renew()
     first = findings.calibration
     arm.teach(np.random.default_rng(8), 12)
@@ -342,9 +342,9 @@ def test_wall_time_without_cpu_time_delays_no_findings() -> None:
 
 def test_of_several_robots_one_finds_at_a_time() -> None:
     clock = Slow()
-    turns = FindingTurns(clock.now)
+    budget = FindingsBudget(clock.now)
     arm = shared(1, FEW)
-    found = [Findings(arm.learning, arm.robot, clock, 2, turns) for _ in range(2)]
+    found = [Findings(arm.learning, arm.robot, clock, 2, budget) for _ in range(2)]
     for findings in found:
         findings.renew()
     assert [findings.calibration is not None for findings in found] == [True, False]
@@ -376,8 +376,8 @@ def test_tool_change_clears_findings_until_next_renewal() -> None:
 
 
 def test_highly_uncertain_tolerance_estimate_is_not_reported() -> None:
-    assert is_told([(0.003, 0.001), (0.001, 0.0005)])
-    assert not is_told([(0.003, 0.001), (0.0003, 0.0001)])
+    assert tolerances_determined([(0.003, 0.001), (0.001, 0.0005)])
+    assert not tolerances_determined([(0.003, 0.001), (0.0003, 0.0001)])
 
 
 def test_failed_findings_are_logged_without_stopping_the_learner(monkeypatch, caplog) -> None:

@@ -19,18 +19,18 @@ from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.learning.uncertainty import ErrorMemory, UncertaintyTracker
 from kbmaps import NLMS, ChainTolerances
 
-TOGETHER_S = 1.0
+BATCH_WAIT_PER_ROBOT_S = 1.0
 SETTINGS = LearnerConfig(replays_per_pair=0.0)
 NOMINAL = nominal_model()
 TOLERANCES = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03)
 
 
-def new_learning(together_s: float = TOGETHER_S, nominal: NominalModel = NOMINAL) -> OnlineLearner:
-    return OnlineLearner(nominal, SETTINGS, DirectSolver(), together_s=together_s)
+def new_learning(batch_wait_s: float = BATCH_WAIT_PER_ROBOT_S, nominal: NominalModel = NOMINAL) -> OnlineLearner:
+    return OnlineLearner(nominal, SETTINGS, DirectSolver(), batch_wait_s=batch_wait_s)
 
 
-def taught(pairs: list[Pair], together_s: float) -> OnlineLearner:
-    learning = new_learning(together_s)
+def taught(pairs: list[Pair], batch_wait_s: float) -> OnlineLearner:
+    learning = new_learning(batch_wait_s)
     teach(learning, pairs, every=NOW_AND_THEN)
     return learning
 
@@ -42,7 +42,7 @@ def with_outliers(pairs: list[Pair], places: list[int]) -> list[Pair]:
 
 def test_instant_learner_learns_pairs_before_outlier_test() -> None:
     scene = Scene.draw(0, 20)
-    era = Regime(
+    regime = Regime(
         NOMINAL.prior,
         KnownArm(NOMINAL.belief(NOMINAL.chain, TOLERANCES), TOLERANCES),
         UncertaintyTracker(NOMINAL.bases, 0.1),
@@ -51,17 +51,17 @@ def test_instant_learner_learns_pairs_before_outlier_test() -> None:
     )
     reference = NLMS(NOMINAL.prior)
     for pair in scene.pairs:
-        era.meet(pair)
+        regime.learn_instantly(pair)
         reference.learn(pair.q, pair.x)
-    assert era.memory.count == 0
-    np.testing.assert_allclose(era.models.map(INSTANT).net, reference.map.net, atol=1e-10)
+    assert regime.memory.count == 0
+    np.testing.assert_allclose(regime.models.map(INSTANT).net, reference.map.net, atol=1e-10)
 
 
 def test_batches_find_the_same_outliers_as_single_pairs() -> None:
     wild = [60, 70, 81, 95]
     pairs = with_outliers(Scene.draw(1, 100).pairs, wild)
     good = np.delete([pair.x for pair in pairs], wild, axis=0)
-    for seconds in (TOGETHER_S, 0.0):
+    for seconds in (BATCH_WAIT_PER_ROBOT_S, 0.0):
         state = taught(pairs, seconds).state()
         assert state.header.counters.doubted == 4
         np.testing.assert_array_equal(state.arrays["x"], good)
@@ -70,7 +70,7 @@ def test_batches_find_the_same_outliers_as_single_pairs() -> None:
 @pytest.mark.soak
 def test_batched_pairs_teach_as_well_as_single_pairs() -> None:
     scene = Scene.draw(2, 60)
-    together, each = (scene.error_m(taught(scene.pairs, seconds)) for seconds in (TOGETHER_S, 0.0))
+    together, each = (scene.error_m(taught(scene.pairs, seconds)) for seconds in (BATCH_WAIT_PER_ROBOT_S, 0.0))
     assert together < 1.1 * each
 
 
@@ -84,7 +84,7 @@ def test_waiting_pairs_are_judged_without_further_pairs() -> None:
     learning, pairs = new_learning(), Scene.draw(3, 43).pairs
     teach(learning, pairs, background=False)
     waiting = learning.curve[-1].pairs
-    learning.judge_due(pairs[-1].t + TOGETHER_S)
+    learning.learn_due(pairs[-1].t + BATCH_WAIT_PER_ROBOT_S)
     assert (waiting < 43, learning.curve[-1].pairs) == (True, 43)
 
 
@@ -104,7 +104,7 @@ def test_change_is_detected_within_one_batch(moved_m: float) -> None:
     chain, q = built_chain(rng), path(rng, 200)
     pairs = measured(chain, q[:before], rng)
     pairs += measured(chain.with_tool([moved_m, 0.0, 0.0]), q[before:], rng, first=before + 1)
-    noticed = [taught(pairs, seconds).change for seconds in (0.0, TOGETHER_S)]
+    noticed = [taught(pairs, seconds).change for seconds in (0.0, BATCH_WAIT_PER_ROBOT_S)]
     at_once, together = (0 if change is None else change.noticed_seq for change in noticed)
     assert before < at_once
     assert before < together <= at_once + OnlineSettings.most_together
@@ -115,7 +115,7 @@ def test_pairs_after_a_change_join_the_new_regime() -> None:
     chain, q = built_chain(rng), path(rng, before + 50)
     moved = chain.with_tool([0.3, 0.0, 0.0])
     pairs = measured(chain, q[:before], rng) + measured(moved, q[before:], rng, first=before + 1)
-    learning = taught(pairs, TOGETHER_S)
+    learning = taught(pairs, BATCH_WAIT_PER_ROBOT_S)
     assert learning.counters.changes == 1
     np.testing.assert_array_equal(learning.state().arrays["x"], [pair.x for pair in pairs[before:]])
 

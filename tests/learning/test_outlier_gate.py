@@ -17,7 +17,7 @@ NEAR, LIMIT, FAR = 0.001, 0.01, 0.1
 
 def meet(doubts: OutlierGate, number: int, distance_m: float) -> None:
     """Add an outlier identified by its number."""
-    doubts.doubt(np.full(1, float(number)), np.full(3, float(number)), distance_m, LIMIT)
+    doubts.classify(np.full(1, float(number)), np.full(3, float(number)), distance_m, LIMIT)
 
 
 def run(doubts: OutlierGate) -> list[float]:
@@ -30,23 +30,23 @@ def test_run_contains_only_consecutive_outliers() -> None:
     doubts = OutlierGate(1)
     for number, distance in enumerate([FAR, FAR, NEAR, FAR, FAR, FAR]):
         meet(doubts, number, distance)
-    assert (doubts.in_a_row, run(doubts)) == (3, [3.0, 4.0, 5.0])
+    assert (doubts.consecutive, run(doubts)) == (3, [3.0, 4.0, 5.0])
 
 
 def test_a_pair_that_is_believed_ends_the_run() -> None:
     doubts = OutlierGate(1)
     for number, distance in enumerate([FAR, FAR, NEAR]):
         meet(doubts, number, distance)
-    assert (doubts.in_a_row, run(doubts)) == (0, [])
+    assert (doubts.consecutive, run(doubts)) == (0, [])
 
 
 def test_a_restored_run_goes_on() -> None:
     doubts, again = OutlierGate(1), OutlierGate(1)
     for number in range(2):
         meet(doubts, number, FAR)
-    again.restore(*doubts.run(), doubts.in_a_row)
+    again.restore(*doubts.run(), doubts.consecutive)
     meet(again, 2, FAR)
-    assert (again.in_a_row, run(again)) == (3, [0.0, 1.0, 2.0])
+    assert (again.consecutive, run(again)) == (3, [0.0, 1.0, 2.0])
 
 
 def test_run_is_limited_to_newest_change_pairs() -> None:
@@ -60,12 +60,12 @@ def test_initial_pairs_contradicting_fitted_tool_join_no_run() -> None:
     nominal, scene = nominal_model(), Scene.draw(0, 8)
     tolerances = ChainTolerances(tool=0.03)
     arm = KnownArm(nominal.belief(nominal.chain, tolerances), tolerances)
-    era = Regime(nominal.prior, arm, UncertaintyTracker(nominal.bases, 0.1), LearnerConfig(), itertools.count())
+    regime = Regime(nominal.prior, arm, UncertaintyTracker(nominal.bases, 0.1), LearnerConfig(), itertools.count())
     x = np.array([pair.x for pair in scene.pairs])
     x[0] += 0.2  # with the old tool
-    era.begin_with(scene.q[:6], x[:6])
-    era.gate.doubt(scene.q[6], x[6], FAR, LIMIT)
-    era.set_aside(scene.chain.to_kbmap(nominal.bases))
-    era.gate.doubt(scene.q[7], x[7], FAR, LIMIT)
-    np.testing.assert_array_equal(era.gate.run()[0], scene.q[6:])
-    np.testing.assert_array_equal(era.memory.all()[0], scene.q[1:6])
+    regime.learn_former_outliers(scene.q[:6], x[:6])
+    regime.gate.classify(scene.q[6], x[6], FAR, LIMIT)
+    regime.drop_outliers(scene.chain.to_kbmap(nominal.bases))
+    regime.gate.classify(scene.q[7], x[7], FAR, LIMIT)
+    np.testing.assert_array_equal(regime.gate.run()[0], scene.q[6:])
+    np.testing.assert_array_equal(regime.memory.all()[0], scene.q[1:6])

@@ -13,16 +13,16 @@ def filled(pairs: int, capacity: int) -> PairMemory:
 
 
 def test_few_remembered_pairs_are_all_sampled() -> None:
-    q, *_ = filled(80, 1000).some(70, 100)
+    q, *_ = filled(80, 1000).spread_before(70, 100)
     np.testing.assert_array_equal(q[:, 0], np.arange(70))
 
 
 def test_many_pairs_are_sampled_as_runs_of_neighbours() -> None:
-    q, *_ = filled(5000, 4000).some(4500, 100)
+    q, *_ = filled(5000, 4000).spread_before(4500, 100)
     runs = q[:, 0].reshape(-1, RUN)
     assert (runs[0, 0], runs[-1, -1]) == (1000, 4499)
     np.testing.assert_array_equal(np.diff(runs, axis=1), 1)
 
 
 def test_sample_has_no_more_pairs_than_requested() -> None:
-    assert len(filled(500, 500).some(500, RUN // 2)[0]) == RUN // 2
+    assert len(filled(500, 500).spread_before(500, RUN // 2)[0]) == RUN // 2

@@ -110,6 +110,6 @@ def test_non_finite_state_is_not_restored(scene, name) -> None:
     learning = new_learning()
     teach(learning, scene.pairs[:5])
     state = learning.state()
-    poisoned = LearningState(state.header, {**state.arrays, name: state.arrays[name] * np.nan})
+    invalid_array = LearningState(state.header, {**state.arrays, name: state.arrays[name] * np.nan})
     with pytest.raises(StateError, match=f"{name} is not finite"):
-        OnlineLearner(nominal_model(), LearnerConfig(), DirectSolver()).restore(poisoned)
+        OnlineLearner(nominal_model(), LearnerConfig(), DirectSolver()).restore(invalid_array)

@@ -91,8 +91,8 @@ def rigid_error_m(real: RigidChain, seed: int, tolerances: ChainTolerances | Non
     solver.learn(q, real.positions(q) + 0.02 * rng.normal(size=(len(q), 3)))
     chain = next(solved.model for solved in solver.solutions() if solved.name == RIGID and solved.pairs == len(q))
     assert chain is not None
-    asked = near(rng, q)
-    return float(np.linalg.norm(chain.predict(asked) - real.positions(asked), axis=1).mean())
+    solution_requested = near(rng, q)
+    return float(np.linalg.norm(chain.predict(solution_requested) - real.positions(solution_requested), axis=1).mean())
 
 
 def test_tolerance_selection_helps_on_a_nominal_arm() -> None:

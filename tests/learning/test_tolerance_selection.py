@@ -13,7 +13,7 @@ from bodyschema.learning.model_bank import RIGID
 from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.learning.regime_history import Regimes
 from bodyschema.learning.solvers.solver import Solved, fitted_belief
-from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
+from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, select_tolerances
 from kbmaps import ChainTolerances, RigidLearner
 
 NOMINAL, SCENE = nominal_model(), Scene.draw(0, 40)
@@ -34,17 +34,19 @@ def test_improbable_narrow_tolerances_leave_chain_unchanged() -> None:
 
 
 def test_tool_change_continues_from_the_wide_tolerance_belief() -> None:
-    eras = Regimes.at_nominal(NOMINAL, LearnerConfig(), itertools.count())
-    era, wide = eras.present, belief_in(WIDE)
-    assert era is not None
+    regimes = Regimes.initial(NOMINAL, LearnerConfig(), itertools.count())
+    regime, wide = regimes.current, belief_in(WIDE)
+    assert regime is not None
     narrow = wide.tightened(WIDE, GOOD)[0]
-    era.begin_with(SCENE.q, np.array([pair.x for pair in SCENE.pairs]))
+    regime.learn_former_outliers(SCENE.q, np.array([pair.x for pair in SCENE.pairs]))
     kbmap = narrow.chain.to_kbmap(NOMINAL.bases)
-    era.take(Solved(era.task_number, 40, RIGID, kbmap, narrow, wide=wide), kbmap, 40)
-    eras.change_tool(era)
-    assert eras.present is not None
+    regime.take(Solved(regime.task_number, 40, RIGID, kbmap, narrow, wide=wide), kbmap, 40)
+    regimes.change_tool(regime)
+    assert regimes.current is not None
     axes = slice(0, wide.parameters.zeros.start)
-    np.testing.assert_allclose(eras.present.arm.chain.covariance[axes, axes], wide.covariance[axes, axes], atol=1e-12)
+    np.testing.assert_allclose(
+        regimes.current.arm.chain.covariance[axes, axes], wide.covariance[axes, axes], atol=1e-12
+    )
 
 
 def test_narrow_tolerances_do_not_move_well_determined_chain() -> None:
@@ -56,8 +58,8 @@ def test_narrow_tolerances_do_not_move_well_determined_chain() -> None:
         scene = Scene.draw(seed, 400)
         q = np.random.default_rng(seed).uniform(-1.0, 1.0, scene.q.shape)
         x = scene.chain.positions(q) + 1e-5 * np.random.default_rng(seed).normal(size=(len(q), 3))
-        wide = fitted_belief(nominal.belief(nominal.placed(q, x), chain_tolerances(LearnerConfig())), q, x)
-        made = best_tolerances(wide, tolerances, workmanship(wide, tolerances, q))
+        wide = fitted_belief(nominal.belief(nominal.aligned_chain(q, x), chain_tolerances(LearnerConfig())), q, x)
+        made = best_tolerances(wide, tolerances, select_tolerances(wide, tolerances, q))
         apart = made.predict(q) - scene.chain.positions(q)
         off.append(float(np.sqrt(np.square(apart).sum(axis=1).mean())))
         np.testing.assert_allclose(

@@ -23,7 +23,7 @@ DRAWN = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
 
 def new_claims(belief: ChainBelief = DRAWN) -> UncertaintyTracker:
     claims = UncertaintyTracker(NOMINAL.bases, 0.1)
-    claims.expect(belief)
+    claims.set_prior(belief)
     return claims
 
 
@@ -120,8 +120,8 @@ def test_sigma_outside_first_pairs_covers_nominal_model_error(known: tuple[bool,
 def test_solution_sigma_grows_by_its_misfit_outside_data(walk: FloatArray) -> None:
     claims = new_claims()
     learnt(claims, walk, prior_error_m=0.04)
-    claims.solution_asked()
-    claims.solution_taken(RIGID, np.full((50, 3), 0.005), sure_belief(), neighbours=True)
+    claims.record_request()
+    claims.record_solution(RIGID, np.full((50, 3), 0.005), sure_belief(), neighbours=True)
     assert sigma(claims, RIGID, walk) == pytest.approx(0.005, rel=0.1)
     assert sigma(claims, RIGID, FAR) == pytest.approx(np.sqrt(2.0) * 0.005, rel=0.2)
 
@@ -129,9 +129,9 @@ def test_solution_sigma_grows_by_its_misfit_outside_data(walk: FloatArray) -> No
 def test_residuals_within_noise_do_not_raise_sigma(walk: FloatArray) -> None:
     claims = new_claims()
     learnt(claims, walk, prior_error_m=0.04)
-    claims.solution_asked()
+    claims.record_request()
     noise = np.random.default_rng(0).normal(0.0, np.sqrt(NOISE[0]), (50, 3))
-    claims.solution_taken(RIGID, noise, sure_belief(), neighbours=True)
+    claims.record_solution(RIGID, noise, sure_belief(), neighbours=True)
     assert sigma(claims, RIGID, walk) < 1e-6
 
 
@@ -139,10 +139,10 @@ def test_residuals_within_noise_do_not_raise_sigma(walk: FloatArray) -> None:
 def test_previously_answering_model_wins_tie_after_tool_change(answered: str, walk: FloatArray) -> None:
     claims = new_claims()
     claims.change_tool(0.1, answered)
-    claims.expect(DRAWN)
+    claims.set_prior(DRAWN)
     far, alike = 0.04, 0.002
     for name in (RIGID, RESIDUAL):
-        claims.solution_taken(name, np.zeros((10, 3)), None, neighbours=True)
+        claims.record_solution(name, np.zeros((10, 3)), None, neighbours=True)
     for row in walk[:10]:
         x = MODEL.predict(row[None]) + alike
         missed = {PRIOR: far, INSTANT: far, RIGID: alike, RESIDUAL: alike}
@@ -154,7 +154,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
     claims, again = new_claims(), new_claims()
     learnt(claims, walk, prior_error_m=0.04)
     claims.change_tool(0.1)
-    claims.expect(DRAWN)
+    claims.set_prior(DRAWN)
     learnt(claims, walk[:30], prior_error_m=0.01, error_m=0.02)
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(claims.state()), type=UncertaintyState)
     again.restore(state, claims.arrays())

@@ -20,7 +20,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.robot.lerobot import read_calibration
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rig_file import write_rig
-from bodyschema.vision.rig.stereo_rig import Made, OneEyeRig
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, OneEyeRig
 
 pytest.importorskip("pyarrow")
 sys.path.append(str(DOCS.parent / "tests" / "daemon"))
@@ -32,7 +32,7 @@ T_BASE_CAMERA = np.array([[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.
 OFFSETS_DEG = np.array([0.0, 2.5, -3.0, 1.5, 0.0])
 FAST, SLOW = [0.78, 1.0, 1.4, 1.9, 1.1], [0.25, 0.34, 0.43, 0.52, 0.38]  # [rad/s]
 BALL_MM, FRAMES, RATE_HZ = 40.0, 150, 12.0
-MADE = Made("2026-01-01T00:00:00Z", "a board", 20, 0, 0.05, 0.05, 1e-4)
+MADE = CalibrationProvenance("2026-01-01T00:00:00Z", "a board", 20, 0, 0.05, 0.05, 1e-4)
 
 
 def film(file: Path, places: np.ndarray) -> None:

@@ -39,7 +39,7 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "edge_sigma_px": 0.02,
         "floor_px": 0.05,
     },
-    (figures.ball, "bodyschema.vision.ball.settings.LimbSettings"): {
+    (figures.ball, "bodyschema.vision.ball.settings.ContourSettings"): {
         "inside_px": 0.1,
         "usual_blur_px": 0.25,
         "inner_part": 0.25,
@@ -50,7 +50,7 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "least_density": 0.25,
         "channels_noise": 0.15,
         "usual_density": 0.15,
-        "told": 0.25,
+        "measured": 0.25,
     },
     (figures.tag, "bodyschema.vision.tags.settings.EdgeSettings"): {
         "clear_share": 0.25,

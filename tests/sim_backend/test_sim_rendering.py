@@ -10,7 +10,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.sim_backend import CameraConfig
 from bodyschema.sim_backend.bullet import load_pybullet
 from bodyschema.sim_backend.config import SimTag
-from bodyschema.sim_backend.rendering.eye import TO_LIGHT, StereoEyes, cluttered_room
+from bodyschema.sim_backend.rendering.eye import TO_LIGHT, StereoRenderer, cluttered_room
 from bodyschema.sim_backend.rendering.raster import Grid, Raster
 
 PLAIN = CameraConfig(noise=0, clutter=0)
@@ -32,7 +32,7 @@ def painted(bullet, x, config=PLAIN, seed=0, T_world_camera=None, turn=UNTURNED)
     """Return left and right image of a marker at `x` in the left optical frame."""
     T = np.eye(4) if T_world_camera is None else T_world_camera
     images = tuple(np.zeros((480, 640, 3), dtype=np.uint8) for _ in range(2))
-    eyes = StereoEyes(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
+    eyes = StereoRenderer(Raster(*bullet, CALIBRATION, TO_LIGHT), CALIBRATION, config, seed)
     eyes.paint(0, T, np.stack([x, x - [CALIBRATION.baseline_m, 0, 0]]), turn, images)
     return images
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shown_board import BOARD, SIZE, true_vector
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
+from bodyschema.vision.calibration.calibrate import Calibrated, CalibrationRequest, ModelChoice, calibrate
 from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.rig.stereo_rig import CalibrationError, covariance_of, triangulated
@@ -67,8 +67,8 @@ def figures(truth: TrueRig, found: Calibrated) -> Figures:
         shape_mm=1e3 * float(np.sqrt(np.mean(np.sum((aligned(seen, x) - x) ** 2, axis=1)))),
         z=z,
         position_z=(seen[middle] - x[middle]) / np.sqrt(np.diag(covariance)),
-        held_out_px=rig.made.held_out_px,
-        left_out=rig.made.left_out,
+        held_out_px=rig.provenance.held_out_px,
+        left_out=rig.provenance.left_out,
     )
 
 
@@ -80,7 +80,7 @@ def calibrated_rig(seed: int, *, fisheye: bool, model: ModelChoice = "auto") -> 
     frames = [photographer.pair(*pose) for pose in poses(rng, truth, Printed(), VIEWS)]
     pairs = [ImagePair(f"{k:02d}", frame.left, frame.right) for k, frame in enumerate(frames)]
     try:
-        asked = Asked(SIZE, ("A1", "B2"), "2026", model=model, scale_sigma=0.0)
+        asked = CalibrationRequest(SIZE, ("A1", "B2"), "2026", model=model, scale_sigma=0.0)
         return figures(truth, calibrate(gathered(pairs, BOARD).views, BOARD, asked))
     except CalibrationError as error:
         return str(error)

@@ -15,7 +15,7 @@ from bodyschema.vision.board import Board, Corners, NotFound
 from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.lens import Model
-from bodyschema.vision.rig.stereo_rig import Made, StereoRig, parameter_names, split
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, StereoRig, parameter_names, split
 
 SIZE = (640, 480)
 BOARD = Board()
@@ -32,7 +32,7 @@ def known_rig(rig: TrueRig, serials: tuple[str, str] = ("A1", "B2")) -> StereoRi
     """Return the true rig as a calibration with negligible uncertainty."""
     model: Model = "fisheye" if rig.left.fisheye else "pinhole"
     n = len(parameter_names(model))
-    made = Made("2026-01-01T00:00:00Z", BOARD.name, 20, 0, 0.03, 0.03, 0.0)
+    made = CalibrationProvenance("2026-01-01T00:00:00Z", BOARD.name, 20, 0, 0.03, 0.03, 0.0)
     return StereoRig(*split(model, true_vector(rig)), rig.size_px, serials, 1e-10 * np.eye(n), made)
 
 

@@ -14,7 +14,7 @@ from scenes import RADIUS_M, Errors, compare, measure_errors, place
 from benchmarks.tables import Column, Table
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss
-from bodyschema.vision.ball.contour import Limb
+from bodyschema.vision.ball.contour import BallContour
 from bodyschema.vision.ball.tracker import StereoTracker
 
 LOOKS = {
@@ -147,7 +147,7 @@ def test_limb_evenness_is_share_of_carrying_rays():
     rays = np.zeros((8, 3))
     for carrying in (2, 4, 8):
         weight = np.where(np.arange(8) < carrying, 50.0, 0.0)
-        assert Limb(rays, np.zeros(8), weight, 0.8, 1.0).evenness == pytest.approx(carrying / 8)
+        assert BallContour(rays, np.zeros(8), weight, 0.8, 1.0).evenness == pytest.approx(carrying / 8)
 
 
 def test_more_image_noise_makes_the_claimed_sigma_larger():

@@ -46,8 +46,8 @@ def test_ball_is_circled_and_tag_is_not(marker, circled) -> None:
     grey = np.full((240, 320, 3), 40, dtype=np.uint8)
     fix = MarkerFix(t=0.0, x=np.array([0.0, 0.0, 0.5]), cov=1e-8 * np.eye(3), centres_px=(160.0, 120.0, 100.0, 120.0))
     above = AT[1] - round(700.0 * VisionConfig().radius_m / 0.5) - 2
-    drawn = Annotator(CAMERAS, VisionConfig(marker=marker)).drawn(StereoFrame(0.0, grey, grey), fix)
-    assert bool((drawn[above - 1 : above + 2, AT[0]] != 40).any()) == circled
+    annotated = Annotator(CAMERAS, VisionConfig(marker=marker)).annotated(StereoFrame(0.0, grey, grey), fix)
+    assert bool((annotated[above - 1 : above + 2, AT[0]] != 40).any()) == circled
 
 
 FACING = np.diag([1.0, -1.0, -1.0])
@@ -59,7 +59,7 @@ def shown(ids: tuple[int, ...], wanted: int) -> tuple[np.ndarray, MarkerFix | No
     frame = photograph(tags, SMALL, Look(wall=0.4, samples=2), np.random.default_rng(0))
     config = VisionConfig(marker="tag", tag=TagConfig(id=wanted, side_m=0.04))
     seen = tracker_of(SMALL, config).track(frame)
-    picture = Annotator(SMALL, config).drawn(frame, seen)
+    picture = Annotator(SMALL, config).annotated(frame, seen)
     return picture[30:, : SMALL.image_size_px[0]], seen if isinstance(seen, MarkerFix) else None
 
 

@@ -43,33 +43,33 @@ def size_after(fixes: int, radius_m: float = RADIUS_M) -> BallSize:
 
 def test_matching_size_leaves_covariance_unchanged() -> None:
     found = located()
-    assert size_after(5).doubted(found) is found
+    assert size_after(5).with_size_error(found) is found
 
 
 def test_size_mismatch_in_both_eyes_inflates_centre_covariance() -> None:
     found = located(smaller=0.04, pulled_px=0.5)
-    doubted = size_after(5).doubted(found)
-    off = doubted.x - X
+    with_size_error = size_after(5).with_size_error(found)
+    off = with_size_error.x - X
     assert off @ np.linalg.solve(found.cov, off) > 20.0**2
-    assert off @ np.linalg.solve(doubted.cov, off) < 2.0**2
+    assert off @ np.linalg.solve(with_size_error.cov, off) < 2.0**2
 
 
 def test_first_fix_is_checked_against_configured_radius() -> None:
     found = located(smaller=0.1, pulled_px=0.5)
-    assert BallSize(SMALL).doubted(found).cov[1, 1] > 100.0 * found.cov[1, 1]
+    assert BallSize(SMALL).with_size_error(found).cov[1, 1] > 100.0 * found.cov[1, 1]
 
 
 def test_a_radius_that_was_measured_badly_is_learnt() -> None:
     wrong_m = 1.08 * RADIUS_M
     found = located(radius_m=wrong_m)
-    assert BallSize(SMALL).doubted(found) is not found
-    assert size_after(3, wrong_m).doubted(found) is found
+    assert BallSize(SMALL).with_size_error(found) is not found
+    assert size_after(3, wrong_m).with_size_error(found) is found
 
 
 def test_outlier_size_does_not_disturb_learnt_size() -> None:
     size = size_after(10)
     size.learn(located(smaller=0.2))
-    assert size.doubted(located()).cov[2, 2] == located().cov[2, 2]
+    assert size.with_size_error(located()).cov[2, 2] == located().cov[2, 2]
 
 
 def test_swapped_in_other_size_is_refused_marker_refound() -> None:

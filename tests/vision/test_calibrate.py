@@ -16,8 +16,8 @@ from shown_board import BOARD, NOISE_PX, SIZE, corner_views, photographed, true_
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Corners, NotFound
 from bodyschema.vision.calibration.bundle import POSE, Linear
-from bodyschema.vision.calibration.calibrate import Asked, Fitted, calibrate, fit
-from bodyschema.vision.calibration.gather import Unusable, gathered, require_both, summarised
+from bodyschema.vision.calibration.calibrate import CalibrationRequest, Fitted, calibrate, fit
+from bodyschema.vision.calibration.gather import Unusable, gathered, require_both, summary_lines
 from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.held_out import covariance
 from bodyschema.vision.calibration.image_pairs import ImagePair
@@ -26,7 +26,7 @@ from bodyschema.vision.calibration.weights import corner_weights
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 
-ASKED = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
+ASKED = CalibrationRequest(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", scale_sigma=0.0)
 PINHOLE = replace(ASKED, model="pinhole")
 
 
@@ -42,7 +42,7 @@ def upside_down(corners: Corners | None) -> Corners | None:
     return None if corners is None else replace(corners, px=np.array(SIZE) - 1 - corners.px)
 
 
-def refusal(views: list[View], asked: Asked = PINHOLE, board=BOARD) -> str:
+def refusal(views: list[View], asked: CalibrationRequest = PINHOLE, board=BOARD) -> str:
     with pytest.raises(CalibrationError) as raised:
         calibrate(views, board, asked)
     return str(raised.value)
@@ -160,7 +160,7 @@ def test_a_model_that_is_refused_leaves_the_others(planted, monkeypatch) -> None
     monkeypatch.setattr("bodyschema.vision.calibration.calibrate.fit", only_fisheye)
     told: list[str] = []
     found = calibrate(planted[1][:10], BOARD, ASKED, told.append)
-    assert list(found.rivals_px) == ["fisheye"]
+    assert list(found.held_out_by_model_px) == ["fisheye"]
     assert "pinhole lenses do not fit: it folds over" in told
 
 
@@ -276,7 +276,7 @@ def test_shrunken_board_is_contradicted_by_measured_baseline(planted) -> None:
     views = [view_of(str(k), photographer, pose, rng) for k, pose in enumerate(poses(rng, rig, small, 12))]
     by_hand = replace(PINHOLE, baseline_m=round(rig.baseline_m, 3))
     assert "make the squares 97" in refusal(views, by_hand)
-    assert calibrate(views, replace(BOARD, square_m=0.97 * 0.030), by_hand).rig.made.views == 12
+    assert calibrate(views, replace(BOARD, square_m=0.97 * 0.030), by_hand).rig.provenance.views == 12
 
 
 def test_excessive_pixel_noise_fails_held_out_error_check(planted) -> None:
@@ -333,7 +333,7 @@ def test_images_with_same_fault_share_one_line() -> None:
     blurred = NotFound("blurred", "the sharpest edge has 3.7 px"), NotFound("blurred", "the sharpest edge has 2.9 px")
     unusable = [Unusable(f"{k:02d}", "left", blurred[k == 2]) for k in range(6)]
     unusable.append(Unusable("03", "right", NotFound("not_found", "no board")))
-    assert summarised(unusable) == [
+    assert summary_lines(unusable) == [
         "00, 01, 02 and 3 more, left image: the sharpest edge has 3.7 px",
         "03, right image: no board",
     ]

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
 from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, TwoConfig, VideosConfig
-from bodyschema.vision.cameras.image_roll import ImageRoll
-from bodyschema.vision.cameras.look import of_image
+from bodyschema.vision.cameras.image_monitor import exposure_fault
+from bodyschema.vision.cameras.image_reader import ImageReader
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.pairing import Pairing, Shot
 from bodyschema.vision.cameras.stamps import Stamps, _Settings
@@ -102,7 +102,7 @@ def test_implausible_kernel_timestamps_are_replaced_by_arrival_time(kernel) -> N
 def test_a_stamp_that_goes_back_costs_one_frame() -> None:
     stamps, times = stamped([(1.0, 1.1), (2.0, 2.1), (3.0, 3.1), (2.5, 3.5), (4.0, 4.1)])
     assert times[-3:] == [3.0, None, 4.0]
-    assert stamps.doubted == 1
+    assert stamps.rejected == 1
 
 
 def shots(pairing: Pairing, stream: list[tuple[float, int]]) -> list[tuple[float, float]]:
@@ -136,14 +136,14 @@ def test_images_too_far_apart_are_counted_not_paired() -> None:
 @pytest.mark.parametrize(("level", "words"), [(0, "lens cap"), (255, "over-exposed"), (128, None)])
 def test_an_image_is_black_white_or_fine(level, words) -> None:
     image = np.full((120, 160, 3), level, np.uint8)
-    said = of_image(image, "left camera")
+    said = exposure_fault(image, "left camera")
     assert said is None if words is None else words in str(said)
 
 
 def test_white_wall_in_corner_is_not_over_exposure() -> None:
     image = np.full((120, 160, 3), 128, np.uint8)
     image[:50, :60] = 255
-    assert of_image(image, "left camera") is None
+    assert exposure_fault(image, "left camera") is None
 
 
 # --- which camera
@@ -185,7 +185,7 @@ def write_images(folder: Path, names: list[str], size_px: tuple[int, int] = (32,
 
 def test_numbers_in_names_count_as_numbers(tmp_path) -> None:
     write_images(tmp_path, ["l_9.png", "l_10.png", "r_9.png", "r_10.png"])
-    roll = ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
+    roll = ImageReader(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
     roll.open(0)
     assert [int(roll.next()[0].mean()) for _ in range(2)] == [0, 10]
 
@@ -193,7 +193,7 @@ def test_numbers_in_names_count_as_numbers(tmp_path) -> None:
 def test_nanosecond_names_give_exact_times_and_eye_offset(tmp_path) -> None:
     write_images(tmp_path, [f"{eye}_{n}.png" for n in (1403636579763555584, 1403636579813555456) for eye in "l"])
     write_images(tmp_path, [f"{eye}_{n}.png" for n in (1403636579764555584, 1403636579814555456) for eye in "r"])
-    roll = ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", name_ticks_per_s=1e9), tmp_path)
+    roll = ImageReader(ImagesConfig(left="l_*.png", right="r_*.png", name_ticks_per_s=1e9), tmp_path)
     assert np.diff(roll.t) == pytest.approx([0.049999872], abs=1e-9)
     assert roll.t_sigma == pytest.approx([1e-3, 1e-3], abs=1e-9)
 
@@ -201,14 +201,14 @@ def test_nanosecond_names_give_exact_times_and_eye_offset(tmp_path) -> None:
 def test_unequal_image_counts_are_refused(tmp_path) -> None:
     write_images(tmp_path, ["l_1.png", "l_2.png", "r_1.png"])
     with pytest.raises(ConfigError, match=r"l_\*.png are 2 images, r_\*.png are 1"):
-        ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
+        ImageReader(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
 
 
 def test_eyes_of_different_sizes_are_refused(tmp_path) -> None:
     write_images(tmp_path, ["l_1.png"])
     write_images(tmp_path, ["r_1.png"], (64, 24))
     with pytest.raises(SourceError, match=r"32x24 pixels in .*l_1.png, 64x24 pixels"):
-        ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
+        ImageReader(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_times_not_fitting_the_images_are_refused(tmp_path, text, message) -> No
     write_images(tmp_path, ["l_1.png", "l_2.png", "r_1.png", "r_2.png"])
     (tmp_path / "times.txt").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", times="times.txt"), tmp_path)
+        ImageReader(ImagesConfig(left="l_*.png", right="r_*.png", times="times.txt"), tmp_path)
 
 
 def test_real_time_film_skips_unread_frames(tmp_path) -> None:

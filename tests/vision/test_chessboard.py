@@ -196,8 +196,8 @@ def test_blank_wall_has_no_chessboard() -> None:
 
 def test_chessboard_is_drawn_into_its_image() -> None:
     frame = photographed("one", shown(facing(20.0)))
-    drawn = Annotator(ONE, BOARD).drawn(frame, tracker_of(ONE, BOARD).track(frame))
-    assert (drawn[40:200, 60:300] != frame.left[40:200, 60:300]).any(axis=2).sum() > 200
+    annotated = Annotator(ONE, BOARD).annotated(frame, tracker_of(ONE, BOARD).track(frame))
+    assert (annotated[40:200, 60:300] != frame.left[40:200, 60:300]).any(axis=2).sum() > 200
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_band_drift_is_limited_to_half_its_width():
     gate = ColourGate(HueBand(120.0, half_width_deg=20.0))
     for hue in np.linspace(120.0, 200.0, 400):
         rgb = np.array(colorsys.hsv_to_rgb(float(hue) / 360, 0.9, 0.8))
-        gate.follow(np.full((4, 4, 3), np.rint(255 * rgb[::-1]), np.uint8))
+        gate.adapt(np.full((4, 4, 3), np.rint(255 * rgb[::-1]), np.uint8))
     blue_green = np.full((2, 2, 3), np.rint(255 * np.array(colorsys.hsv_to_rgb(155 / 360, 0.9, 0.8))[::-1]), np.uint8)
     assert not gate.mask(blue_green).any()
 

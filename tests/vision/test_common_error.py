@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 from shown_board import SIZE, true_vector
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.pose import PoseEstimator, Sighting, turned
+from bodyschema.vision.pose import PoseEstimator, Sighting, turn_jacobian
 from bodyschema.vision.rig.common_error import CommonError
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rectified import Rectification
-from bodyschema.vision.rig.stereo_rig import Made, OneEyeRig, Rig, StereoRig, split, triangulated
+from bodyschema.vision.rig.stereo_rig import CalibrationProvenance, OneEyeRig, Rig, StereoRig, split, triangulated
 from bodyschema.vision.tags.body import TAG_CORNERS
 
-MADE = Made("", "", 20, 0, 0.0, 0.0, 0.0)
+MADE = CalibrationProvenance("", "", 20, 0, 0.0, 0.0, 0.0)
 SIDE_M = 0.02
 X = np.array([[0.0, 0.0, 0.5], [0.12, -0.06, 0.6], [-0.1, 0.1, 0.4], [0.15, 0.1, 0.7]])
 TILTS = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(8) * np.pi / 4.0])
@@ -33,7 +33,7 @@ def two_eyes(vector: FloatArray, covariance: FloatArray) -> StereoRig:
 
 def beyond_turn(errors: FloatArray) -> FloatArray:
     """Return errors (n, 3) at X without their best-fitting turn of the frame."""
-    rows = turned(X).reshape(-1, 3)
+    rows = turn_jacobian(X).reshape(-1, 3)
     return errors - (rows @ np.linalg.lstsq(rows, errors.ravel())[0]).reshape(-1, 3)
 
 

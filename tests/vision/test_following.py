@@ -204,10 +204,10 @@ def test_tracked_camera_shows_newest_frame_with_detections():
     assert seen is not None
     assert jpeg is not None
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    drawn = annotator.drawn(stage(NEAR), seen)
-    assert picture.shape == drawn.shape
-    assert np.abs(picture.astype(float) - drawn).mean() < 4.0
-    assert np.abs(np.hstack(stage(NEAR).images).astype(float) - drawn).mean() > 6.0
+    annotated = annotator.annotated(stage(NEAR), seen)
+    assert picture.shape == annotated.shape
+    assert np.abs(picture.astype(float) - annotated).mean() < 4.0
+    assert np.abs(np.hstack(stage(NEAR).images).astype(float) - annotated).mean() > 6.0
 
 
 def test_tracked_camera_returns_none_without_frame():

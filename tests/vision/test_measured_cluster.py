@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from bodyschema.cli.main import app
-from bodyschema.daemon.wiring.markers import ClusterFile, Wanted, _require_tags, figures, said, sides_of
+from bodyschema.daemon.wiring.markers import ClusterFile, TagSelection, _require_tags, figures, said, sides_of
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
@@ -23,7 +23,7 @@ from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, meas
 from bodyschema.vision.cluster.tables import cluster_tables
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rig_file import write_rig
-from bodyschema.vision.rig.stereo_rig import CalibrationError, Made, StereoRig, parameter_names
+from bodyschema.vision.rig.stereo_rig import CalibrationError, CalibrationProvenance, StereoRig, parameter_names
 from bodyschema.vision.tags.config import PlacedTag
 from bodyschema.vision.tags.image import TagImage
 
@@ -202,18 +202,18 @@ def test_views_of_single_tags_are_too_few() -> None:
 def test_wanted_tag_in_no_image_is_named() -> None:
     views = looked(built(np.random.default_rng(0)), np.random.default_rng(0))
     with pytest.raises(CalibrationError, match=r"not tag 5, 6 of apriltag_36h11 .* there are 3, 4, 7, 8, 9"):
-        _require_tags(views, {}, Wanted("apriltag_36h11", SIDE_M, (3, 4, 5, 6)))
+        _require_tags(views, {}, TagSelection("apriltag_36h11", SIDE_M, (3, 4, 5, 6)))
 
 
 def test_images_without_tags_of_family_are_refused() -> None:
     with pytest.raises(CalibrationError, match=r"no tag of aruco_6x6_50 .* Are --family"):
-        _require_tags([ClusterView("00", {}, {})], {}, Wanted("aruco_6x6_50", SIDE_M))
+        _require_tags([ClusterView("00", {}, {})], {}, TagSelection("aruco_6x6_50", SIDE_M))
 
 
 def test_duplicate_tag_in_one_image_is_named() -> None:
     views = looked(built(np.random.default_rng(0)), np.random.default_rng(0))
     with pytest.raises(CalibrationError, match=r"tag 3 is there twice in one image \(04, 07\)"):
-        _require_tags(views, {3: ["04", "07"]}, Wanted("apriltag_36h11", SIDE_M))
+        _require_tags(views, {3: ["04", "07"]}, TagSelection("apriltag_36h11", SIDE_M))
 
 
 @pytest.mark.soak
@@ -221,7 +221,7 @@ def test_rendered_images_of_a_cluster_become_its_tables(tmp_path, capsys) -> Non
     rng = np.random.default_rng(5)
     places = built(rng)
     lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
-    made = Made("2026-01-01T00:00:00Z", "none", 20, 0, 0.02, 0.02, 0.0)
+    made = CalibrationProvenance("2026-01-01T00:00:00Z", "none", 20, 0, 0.02, 0.02, 0.0)
     n = len(parameter_names("pinhole"))
     rig = StereoRig(lens, lens, np.zeros(3), np.array([-0.12, 0.0, 0.0]), (640, 480), ("", ""), 1e-10 * np.eye(n), made)
     write_rig(rig, tmp_path / "cameras.toml")

@@ -17,7 +17,7 @@ from tag_renderer import Sheet, photograph
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
+from bodyschema.vision.calibration.calibrate import Calibrated, CalibrationRequest, calibrate
 from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.view import ONE_EYE
 from bodyschema.vision.config import VisionConfig
@@ -149,7 +149,7 @@ def calibrated() -> tuple[TrueRig, Calibrated]:
     rng = np.random.default_rng(31)
     rig = webcams(rng)
     views = [replace(view, right=None) for view in corner_views(rig, rng)]
-    return rig, calibrate(views, BOARD, Asked(SIZE, ("A1",), "2026-01-01T00:00:00Z", model="pinhole"))
+    return rig, calibrate(views, BOARD, CalibrationRequest(SIZE, ("A1",), "2026-01-01T00:00:00Z", model="pinhole"))
 
 
 def test_one_camera_is_calibrated_within_its_intervals(calibrated) -> None:

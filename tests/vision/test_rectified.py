@@ -13,7 +13,7 @@ from shown_board import BOARD, SIZE, Eyes, corner_views, known_rig
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.records import StereoFrame
 from bodyschema.vision.board import BoardDetector, Corners
-from bodyschema.vision.calibration.calibrate import Asked, calibrate
+from bodyschema.vision.calibration.calibrate import CalibrationRequest, calibrate
 from bodyschema.vision.calibration.check import check
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.rectified import Rectification, RectifiedCamera
@@ -96,7 +96,7 @@ def test_image_of_another_size_is_a_source_error() -> None:
 def calibrated() -> tuple[StereoRig, View]:
     rng = np.random.default_rng(21)
     views = corner_views(webcams(rng), rng, 13)
-    asked = Asked(SIZE, ("A1", "B2"), "2026", model="pinhole")
+    asked = CalibrationRequest(SIZE, ("A1", "B2"), "2026", model="pinhole")
     return calibrate(views[:-1], BOARD, asked).rig, views[-1]
 
 

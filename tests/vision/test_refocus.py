@@ -14,7 +14,7 @@ from fake_capture import FakeCapture
 from shown_board import BOARD, SIZE, corner_views, view_of
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.calibration.calibrate import Asked, calibrate, fit
+from bodyschema.vision.calibration.calibrate import CalibrationRequest, calibrate, fit
 from bodyschema.vision.calibration.refocus import focal_spread
 from bodyschema.vision.calibration.view import EYES, ONE_EYE, Eye, View
 from bodyschema.vision.cameras.v4l2.controls import FocusWatch
@@ -116,7 +116,7 @@ def test_board_moved_between_images_is_not_refocusing() -> None:
 
 
 def test_a_refused_calibration_names_the_refocusing_first(wandering) -> None:
-    asked = Asked(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", model="pinhole")
+    asked = CalibrationRequest(SIZE, ("A1", "B2"), "2026-01-01T00:00:00Z", model="pinhole")
     with pytest.raises(CalibrationError, match=r"- a lens refocused between the views") as raised:
         calibrate(wandering, BOARD, asked)
     found = re.search(r"its focal length wanders by (.*)% \(1-sigma\)", str(raised.value))

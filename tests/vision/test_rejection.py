@@ -140,9 +140,9 @@ def test_fingertips_over_small_ball_do_not_pass():
 
 def test_limb_is_occluded_only_if_uneven_in_both():
     matcher = StereoMatcher(SMALL, VisionConfig())
-    left, right = (replace(disc, unrest=6.0) for disc in seen_discs(BALL, level=120.0))
+    left, right = (replace(disc, roughness=6.0) for disc in seen_discs(BALL, level=120.0))
     assert matcher.match([left], [right]) is Reason.OCCLUDED
-    assert isinstance(matcher.match([left], [replace(right, unrest=1.0)]), Location)
+    assert isinstance(matcher.match([left], [replace(right, roughness=1.0)]), Location)
 
 
 def test_slightly_unround_ball_is_found_without_noise():
@@ -297,7 +297,7 @@ def test_disc_measured_in_one_eye_rivals_disc_above():
     mask = np.zeros((240, 320), np.uint8)
     u, v = np.rint(marker[0].centre_px).astype(int)
     cv2.circle(mask, (int(u), int(v)), round(marker[0].radius_px), 255, -1)
-    assert matcher.shows_too(marker[1], [copy[0]], mask, found, in_left=False)
+    assert matcher.may_be_second_marker(marker[1], [copy[0]], mask, found, in_left=False)
 
 
 def test_copy_beside_unmeasured_marker_is_a_reflection():
@@ -307,7 +307,7 @@ def test_copy_beside_unmeasured_marker_is_a_reflection():
     found = matcher.match(*([disc] for disc in mirrored))
     assert isinstance(found, Location)
     both_eyes = ([one, other] for one, other in zip(mirrored, marker, strict=True))
-    assert matcher.doubt(found, *both_eyes) is Reason.REFLECTION
+    assert matcher.ambiguity(found, *both_eyes) is Reason.REFLECTION
 
 
 def test_brightness_from_brighter_part_matches_whole_ball():

@@ -23,7 +23,7 @@ def rig(request) -> StereoRig:
     half = rng.normal(size=(len(known.vector), 60)) * 10.0 ** rng.uniform(-6, 0, len(known.vector))[:, None]
     return StereoRig(
         known.left, known.right, known.rotation_rad, known.translation_m, known.image_size_px, known.serials,
-        half @ half.T, known.made,
+        half @ half.T, known.provenance,
     )  # fmt: skip
 
 
@@ -32,8 +32,8 @@ def test_rig_file_round_trip_restores_all_values(rig, tmp_path) -> None:
     read = read_rig(tmp_path / "cameras.toml")
     np.testing.assert_array_equal(read.vector, rig.vector)
     assert np.abs((read.covariance - rig.covariance) / np.outer(rig.sigma, rig.sigma)).max() < 1e-5
-    assert (read.model, read.serials, read.image_size_px, read.made) == (
-        rig.model, rig.serials, rig.image_size_px, rig.made,
+    assert (read.model, read.serials, read.image_size_px, read.provenance) == (
+        rig.model, rig.serials, rig.image_size_px, rig.provenance,
     )  # fmt: skip
 
 

@@ -348,7 +348,7 @@ def test_a_tag_refused_by_one_eye_tells_why(monkeypatch: pytest.MonkeyPatch) -> 
     faded = slice(None, int(SMALL.project(np.array([one.x, other.x]))[:, 2].mean()))  # up to the other tag
     right[:, faded] = 128.0 + 0.2 * (right[:, faded] - 128.0)
     frame = StereoFrame(0.0, seen(one).left, right.astype(np.uint8))
-    monkeypatch.setattr(EdgeSettings, "least_contrast", 60.0)  # less, and OpenCV does not find the tag
+    monkeypatch.setattr(EdgeSettings, "min_contrast", 60.0)  # less, and OpenCV does not find the tag
     assert reason(TagTracker(SMALL, CUBE, CONFIG).track(frame)) is Reason.LOW_CONTRAST
 
 

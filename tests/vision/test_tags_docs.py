@@ -23,8 +23,8 @@ def test_the_page_shows_every_setting_with_its_default() -> None:
 
 
 def test_the_limits_on_the_page_are_the_trackers() -> None:
-    assert f"less certain than {100 * TagSettings.most_corner_sigma:g} % of the side" in PAGE
-    assert f"differ by less than {EdgeSettings.least_contrast:g} grey levels" in PAGE
+    assert f"less certain than {100 * TagSettings.max_corner_sigma:g} % of the side" in PAGE
+    assert f"differ by less than {EdgeSettings.min_contrast:g} grey levels" in PAGE
 
 
 def test_the_page_s_cluster_is_one() -> None:

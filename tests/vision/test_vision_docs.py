@@ -36,11 +36,11 @@ def test_the_page_names_every_colour():
 
 
 def test_the_limits_on_the_page_are_the_trackers():
-    assert f"no patch of the colour of {PatchSettings.least_pixels} pixels" in PAGE
+    assert f"no patch of the colour of {PatchSettings.min_pixels} pixels" in PAGE
     assert f"closer than {PatchSettings.border_px:g} pixels to the border" in PAGE
     assert "less than three quarters of the outline" in PAGE
-    assert PatchSettings.least_visible == 0.75
-    assert f"less certain than {PatchSettings.most_sigma_px:g} px" in PAGE
+    assert PatchSettings.min_visible == 0.75
+    assert f"less certain than {PatchSettings.max_sigma_px:g} px" in PAGE
     assert f"farther away than {TrackSettings.fastest_m_s:g} m/s allows" in PAGE
 
 

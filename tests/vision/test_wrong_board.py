@@ -25,7 +25,7 @@ from bodyschema.effects import Simulation
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
-from bodyschema.vision.calibration.calibrate import Asked, calibrate
+from bodyschema.vision.calibration.calibrate import CalibrationRequest, calibrate
 from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.rig.rectified import Rectification
@@ -55,7 +55,9 @@ def calibrated(serials: tuple[str, ...]) -> tuple[TrueRig, Rectification]:
     truth, pairs, _ = photographed(count=12)
     shown = [pair if len(serials) > 1 else replace(pair, right=None) for pair in pairs]
     board = replace(BOARD, square_m=TOO_LARGE * BOARD.square_m)
-    return truth, Rectification(calibrate(gathered(shown, board).views, board, Asked(SIZE, serials, "2026")).rig)
+    return truth, Rectification(
+        calibrate(gathered(shown, board).views, board, CalibrationRequest(SIZE, serials, "2026")).rig
+    )
 
 
 def arm(rectification: Rectification, marker: str) -> RobotDescription:

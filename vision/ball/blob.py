@@ -15,7 +15,7 @@ from bodyschema.vision.image_checks import ImageSettings
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline
-from .settings import LimbSettings
+from .settings import ContourSettings
 from .settings import PatchSettings as _Settings
 from .sphere import Pinhole
 
@@ -74,8 +74,8 @@ class Disc:
     radius_sigma_px: float  # 1-sigma of the radius [px]
     level: float  # mean amount of the marker's colour on it [grey levels]
     # roughness of its contour: deviation from the ellipse in variances of its samples; 0 if not computed
-    unrest: float = 0.0
-    blur_px: float = LimbSettings.usual_blur_px  # blur of its contour (1-sigma) [px]
+    roughness: float = 0.0
+    blur_px: float = ContourSettings.usual_blur_px  # blur of its contour (1-sigma) [px]
 
     def is_same_as(self, other: Disc) -> bool:
         """Return True if two discs from overlapping patches show the same ball."""
@@ -90,7 +90,7 @@ def find_patches(image: ImageArray, region: Region, gate: Gate) -> list[Patch]:
             for part in _brighter_parts(image, patch, gate):
                 if not any(part.box == other.box for other in patches):
                     patches.append(part)
-    return sorted(patches, key=lambda patch: -patch.fill)[: _Settings.most_patches]
+    return sorted(patches, key=lambda patch: -patch.fill)[: _Settings.max_patches]
 
 
 def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> Patch | None:
@@ -106,7 +106,7 @@ def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: G
     box = Region(*low.tolist(), *high.tolist())
     mask = gate.mask(box.crop(image))
     fill = float(mask[box.circle_mask(centre_px, radius_px)].mean()) / 255.0
-    return Patch(box, centre_px, radius_px, fill) if fill >= _Settings.least_fill else None
+    return Patch(box, centre_px, radius_px, fill) if fill >= _Settings.min_fill else None
 
 
 def measure(
@@ -115,7 +115,7 @@ def measure(
     eye: Pinhole,
     gate: Gate,
     config: VisionConfig,
-    blur_px: float = LimbSettings.usual_blur_px,
+    blur_px: float = ContourSettings.usual_blur_px,
 ) -> Disc | Reason:
     """Measure the ball's image at `patch`, or return the reason why it cannot be measured.
 
@@ -125,9 +125,9 @@ def measure(
     height, width = image.shape[:2]
     if not _clear_of_border(patch.box, _Settings.border_px, (width, height)):
         return Reason.AT_BORDER
-    if config.marker != "bright_ball" and _washed_out(image, patch):
+    if config.marker != "bright_ball" and _is_overexposed(image, patch):
         return Reason.SATURATED
-    if patch.fill < _Settings.least_fill:
+    if patch.fill < _Settings.min_fill:
         return Reason.OCCLUDED
     around = patch.box.grown(_Settings.apron_px, (width, height))
     corner = np.array([around.left, around.top], dtype=np.float64)
@@ -135,11 +135,11 @@ def measure(
     outline = fit_outline(pixels, gate, patch.centre_px - corner, patch.radius_px, shape)
     if outline is None:
         return Reason.OCCLUDED
-    reason = _not_whole(outline)
+    reason = _incompleteness(outline)
     if reason is not None:
         return reason
     outline = refine_outline(pixels, gate, outline, shape, blur_px)
-    if outline is None or not _is_sure(outline):
+    if outline is None or not _is_certain(outline):
         return Reason.NOT_ROUND
     centre_px = outline.centre_px + corner
     reach = outline.radius_px + _Settings.border_px
@@ -147,11 +147,11 @@ def measure(
         return Reason.AT_BORDER
     # Over the whole ball: the patch may be only its brighter part.
     level = _level(image, Region(0, 0, width, height), centre_px, outline.radius_px, gate)
-    sigma_px, unrest, blur_px = outline.radius_sigma_px, outline.unrest, outline.blur_px
-    return Disc(centre_px, outline.radius_px, outline.cov_px, sigma_px, level, unrest, blur_px)
+    sigma_px, roughness, blur_px = outline.radius_sigma_px, outline.roughness, outline.blur_px
+    return Disc(centre_px, outline.radius_px, outline.cov_px, sigma_px, level, roughness, blur_px)
 
 
-def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
+def rough_disc(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
     """Return a rough disc for a patch that could not be measured or that is partly out of view; None if it is not
     round.
     """
@@ -182,23 +182,23 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
     design = np.column_stack([2.0 * (points - middle), np.ones(len(points))])
     solution = np.linalg.lstsq(design, ((points - middle) ** 2).sum(axis=1), rcond=None)[0]
     centre_px, radius_px = middle + solution[:2], math.sqrt(solution[2] + solution[:2] @ solution[:2])
-    off = np.linalg.norm(points - centre_px, axis=1) - radius_px
-    if math.sqrt(np.mean(off**2)) > _Settings.rough_share * radius_px or radius_px > math.hypot(width, height):
+    deviation_px = np.linalg.norm(points - centre_px, axis=1) - radius_px
+    if math.sqrt(np.mean(deviation_px**2)) > _Settings.rough_share * radius_px or radius_px > math.hypot(width, height):
         return None
     return centre_px, radius_px + 0.5
 
 
-def _is_sure(outline: Outline) -> bool:
+def _is_certain(outline: Outline) -> bool:
     """Return True if the centre is precise enough; the limit is that of a small ball and grows with the radius."""
-    limit_px = _Settings.most_sigma_px * max(1.0, outline.radius_px / _Settings.small_px)
+    limit_px = _Settings.max_sigma_px * max(1.0, outline.radius_px / _Settings.small_px)
     return math.sqrt(float(outline.cov_px.diagonal().max())) <= limit_px
 
 
-def _not_whole(outline: Outline) -> Reason | None:
+def _incompleteness(outline: Outline) -> Reason | None:
     """Return the reason why an outline does not belong to a whole ball, or None."""
-    if outline.visible < _Settings.least_visible or outline.off > _Settings.most_off:
+    if outline.visible < _Settings.min_visible or outline.outlier_share > _Settings.max_outlier_share:
         return Reason.OCCLUDED
-    return Reason.LOW_CONTRAST if outline.uneven > _Settings.most_uneven else None
+    return Reason.LOW_CONTRAST if outline.uneven > _Settings.max_uneven else None
 
 
 def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
@@ -209,13 +209,13 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
     return float(gate.amount(image[first[1] : last[1] + 1, first[0] : last[0] + 1]).mean())
 
 
-def _washed_out(image: ImageArray, patch: Patch) -> bool:
+def _is_overexposed(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
     white = cv2.inRange(patch.box.crop(image), (ImageSettings.white,) * 3, (255,) * 3)
-    if cv2.countNonZero(white) <= _Settings.most_white * np.pi / 4 * white.size:
+    if cv2.countNonZero(white) <= _Settings.max_white * np.pi / 4 * white.size:
         return False
     # The corners of the box show the background.
-    return float(white[patch.box.circle_mask(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _Settings.most_white
+    return float(white[patch.box.circle_mask(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _Settings.max_white
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
@@ -232,11 +232,11 @@ def _patches(mask: ImageArray, region: Region) -> list[Patch]:
     points = np.reshape(points, (-1, 2)).astype(np.int32, copy=False)
     label = cv2.connectedComponents(mask, connectivity=4)[1][mask > 0].astype(np.intp)
     areas = np.bincount(label)
-    by_size = np.argsort(-areas, kind="stable")[: 4 * _Settings.most_patches]
+    by_size = np.argsort(-areas, kind="stable")[: 4 * _Settings.max_patches]
     patches = (
         _patch(mask, points.compress(label == number, axis=0), region)
         for number in by_size
-        if areas[number] >= _Settings.least_pixels
+        if areas[number] >= _Settings.min_pixels
     )
     return [patch for patch in patches if patch is not None]
 
@@ -269,7 +269,7 @@ def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate) -> list[Patch]:
     amount = gate.amount(pixels)
     own = gate.mask(pixels) > 0
     # The ball may be a small part of the patch: use the level that half of the smallest ball exceeds.
-    place = -_Settings.least_pixels // 2
+    place = -_Settings.min_pixels // 2
     strongest = float(np.partition(amount[own], place)[place])
     return [
         part

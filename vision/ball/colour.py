@@ -34,7 +34,7 @@ class Gate(Protocol):
         """
         ...
 
-    def follow(self, pixels: ImageArray) -> None:
+    def adapt(self, pixels: ImageArray) -> None:
         """Learn from BGR pixels (height, width, 3) of the middle of an accepted ball."""
 
     def reset(self) -> None:
@@ -54,21 +54,21 @@ class ColourGate:
         self._first = self._band = band
         self._use(band)
 
-    def follow(self, pixels: ImageArray) -> None:
+    def adapt(self, pixels: ImageArray) -> None:
         """Learn from BGR pixels (height, width, 3) of the middle of an accepted ball."""
         hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).reshape(-1, 3).astype(np.float64)
         off_deg = (2.0 * hsv[:, 0] - self._band.hue_deg + 180.0) % 360.0 - 180.0
-        first, rate = self._first, _Settings.followed
+        first, rate = self._first, _Settings.adapted
         drift_deg = (self._band.hue_deg - first.hue_deg + 180.0) % 360.0 - 180.0 + rate * float(np.median(off_deg))
-        most_deg = _Settings.farthest * first.half_width_deg
+        max_deg = _Settings.farthest * first.half_width_deg
         low = len(hsv) // 10
         saturation, value = (float(np.partition(hsv[:, channel], low)[low]) / 255.0 for channel in (1, 2))
         self._use(
             HueBand(
-                (first.hue_deg + min(max(drift_deg, -most_deg), most_deg)) % 360.0,
+                (first.hue_deg + min(max(drift_deg, -max_deg), max_deg)) % 360.0,
                 first.half_width_deg,
-                _followed(self._band.min_saturation, _Settings.room * saturation, first.min_saturation),
-                _followed(self._band.min_value, _Settings.room * value, first.min_value),
+                _adapted_limit(self._band.min_saturation, _Settings.room * saturation, first.min_saturation),
+                _adapted_limit(self._band.min_value, _Settings.room * value, first.min_value),
             )
         )
 
@@ -113,10 +113,10 @@ class BrightGate:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         return cast(ImageArray, cv2.threshold(grey, self._lowest, 255, cv2.THRESH_BINARY)[1])
 
-    def follow(self, pixels: ImageArray) -> None:
+    def adapt(self, pixels: ImageArray) -> None:
         """Set the limit to half of the ball's brightness, clipped to between half and all of the configured limit."""
         seen = float(np.median(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)))
-        self._lowest = _followed(self._lowest, _Settings.room * seen, self._first)
+        self._lowest = _adapted_limit(self._lowest, _Settings.room * seen, self._first)
 
     def reset(self) -> None:
         """Restore the configured brightness."""
@@ -132,9 +132,9 @@ def gate_of(config: VisionConfig) -> Gate:
     return BrightGate(config.min_brightness) if config.marker == "bright_ball" else ColourGate(config.band)
 
 
-def _followed(limit: float, wanted: float, first: float) -> float:
-    """Move `limit` one step towards `wanted`, clipped to between half of `first` and `first`."""
-    return min(max(limit + _Settings.followed * (wanted - limit), 0.5 * first), first)
+def _adapted_limit(limit: float, target: float, first: float) -> float:
+    """Move `limit` one step towards `target`, clipped to between half of `first` and `first`."""
+    return min(max(limit + _Settings.adapted * (target - limit), 0.5 * first), first)
 
 
 def _hsv_ranges(band: HueBand) -> list[tuple[ImageArray, ImageArray]]:

@@ -46,8 +46,8 @@ def colour_at(image: ImageArray, u: float, v: float) -> HueBand:
             remedy='Click on the middle of the ball, beside its highlight. A ball without colour is a "bright_ball"',
         )
     middle = _mean_hue_deg(seed)
-    alike = (_apart_deg(hsv[..., 0] * 2.0, middle) < _Settings.hues_of_a_click_deg) & _is_colourful(hsv)
-    _, labels = cv2.connectedComponents(alike.astype(np.uint8), connectivity=4)
+    similar = (_hue_difference_deg(hsv[..., 0] * 2.0, middle) < _Settings.hues_of_a_click_deg) & _is_colourful(hsv)
+    _, labels = cv2.connectedComponents(similar.astype(np.uint8), connectivity=4)
     label = labels[row, column]
     pixels = hsv[labels == label] if label else seed
     return _band(_colourful(pixels))
@@ -64,10 +64,10 @@ def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
     frames = list(images)
     if len(frames) < 3:
         raise ColourUnlearnt(f"a motion needs three images or more, not {len(frames)}")
-    behind = np.median(np.stack(frames[:: max(1, len(frames) // 15)]), axis=0).astype(np.uint8)
-    moved = [_colourful(_moving_pixels(frame, behind)) for frame in frames]
+    background = np.median(np.stack(frames[:: max(1, len(frames) // 15)]), axis=0).astype(np.uint8)
+    moved = [_colourful(_moving_pixels(frame, background)) for frame in frames]
     pixels = np.concatenate(moved)
-    if len(pixels) < _Settings.least_pixels * len(frames):
+    if len(pixels) < _Settings.min_pixels * len(frames):
         raise ColourUnlearnt(
             "nothing colourful moves in these images", remedy="Move the ball across the view, and keep the camera still"
         )
@@ -75,7 +75,7 @@ def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
     counts = np.bincount(pixels[:, 0], weights=weight, minlength=180)
     smooth = np.convolve(np.concatenate([counts[-5:], counts, counts[:5]]), np.hanning(11), mode="valid")
     peak_deg = 2.0 * int(np.argmax(smooth))
-    return _band(pixels[_apart_deg(pixels[:, 0] * 2.0, peak_deg) < _Settings.hues_of_a_click_deg])
+    return _band(pixels[_hue_difference_deg(pixels[:, 0] * 2.0, peak_deg) < _Settings.hues_of_a_click_deg])
 
 
 def read_images(files: Sequence[Path]) -> list[ImageArray]:
@@ -102,14 +102,14 @@ def colour_table(band: HueBand) -> str:
     )
 
 
-def _moving_pixels(frame: ImageArray, behind: ImageArray) -> ImageArray:
-    changed = (cv2.absdiff(frame, behind).max(axis=2) > _Settings.changed).astype(np.uint8)
+def _moving_pixels(frame: ImageArray, background: ImageArray) -> ImageArray:
+    changed = (cv2.absdiff(frame, background).max(axis=2) > _Settings.changed).astype(np.uint8)
     changed = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return cv2.cvtColor(frame, cv2.COLOR_BGR2HSV)[changed > 0].astype(np.uint8)
 
 
 def _is_colourful(hsv: np.ndarray) -> np.ndarray:
-    return (hsv[..., 1] >= _Settings.least_saturation) & (hsv[..., 2] >= _Settings.least_value)
+    return (hsv[..., 1] >= _Settings.min_saturation) & (hsv[..., 2] >= _Settings.min_value)
 
 
 def _colourful(pixels: np.ndarray) -> ImageArray:
@@ -121,14 +121,17 @@ def _mean_hue_deg(pixels: ImageArray) -> float:
     return float(np.rad2deg(np.angle(np.exp(1j * angles).mean()))) % 360.0
 
 
-def _apart_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
+def _hue_difference_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
     return np.abs((hue_deg - other_deg + 180.0) % 360.0 - 180.0).astype(np.float64)
 
 
 def _band(pixels: ImageArray) -> HueBand:
     """Return the band around the pixels' hues (n, 3 of HSV), with a margin for other light."""
     middle = _mean_hue_deg(pixels)
-    reach = float(np.quantile(_apart_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _Settings.share)) + _Settings.margin_deg
+    reach = (
+        float(np.quantile(_hue_difference_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _Settings.share))
+        + _Settings.margin_deg
+    )
     saturation, value = (float(np.quantile(pixels[:, channel], 2 * _Settings.share)) / 255.0 for channel in (1, 2))
     return HueBand(
         hue_deg=round(middle, 1) % 360.0,

@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .contour_filters import Filters, filters, places
+from .contour_filters import Filters, edge_filters, sample_offsets
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
-from .settings import LimbSettings as _Settings
+from .settings import ContourSettings as _Settings
 
-_NOTHING = np.finfo(np.float64).tiny  # keeps from dividing by information that is 0
+_MIN_INFORMATION = np.finfo(np.float64).tiny  # keeps from dividing by information that is 0
 
 
 @dataclass(frozen=True, slots=True)
-class Limb:
+class BallContour:
     """The ball's edge, ray by ray."""
 
     rays: FloatArray  # cosine and sine of their directions, and 1, shape (n, 3)
@@ -50,9 +50,9 @@ class Limb:
         return 1.0 - _Settings.best_sigma_px**2 * float(self.weight[self.weight > 0].mean())
 
 
-def find_limb(
+def find_contour(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float
-) -> Limb | None:
+) -> BallContour | None:
     """Measure the edge near an outline that is accurate to a few tenths of a pixel; return None if no ball is visible.
 
     Args:
@@ -61,73 +61,83 @@ def find_limb(
         blur_px: assumed blur of the edge, accurate to about a third [px].
     """
     rays = rays_round(radius_px)
-    at = places(radius_px, blur_px)
-    first_px, last_px = _Settings.inner_part * radius_px, max(radius_px + float(at[0]), 0.5 * radius_px)
+    offsets_px = sample_offsets(radius_px, blur_px)
+    first_px, last_px = _Settings.inner_part * radius_px, max(radius_px + float(offsets_px[0]), 0.5 * radius_px)
     inner = first_px + (last_px - first_px) * _Settings.inner
-    samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + at]), shape)
+    samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + offsets_px]), shape)
     colour = ball_colour(samples[:, : len(_Settings.inner)], gate)
     if colour is None:
         return None
-    turned = cv2.transform(samples, _own_colour_first(colour))
-    channels = np.stack(cast("list[Float32Array]", cv2.split(turned)))
-    limb = channels[..., len(_Settings.inner) :]
-    noise = _noise(channels[1:, :, : len(_Settings.inner)], limb[..., at > _Settings.beyond_blurs * blur_px])
-    return _filtered(rays, limb / np.float32(noise), filters(radius_px, blur_px), blur_px)
+    rotated = cv2.transform(samples, _colour_basis(colour))
+    channels = np.stack(cast("list[Float32Array]", cv2.split(rotated)))
+    edge_samples = channels[..., len(_Settings.inner) :]
+    noise = _noise(
+        channels[1:, :, : len(_Settings.inner)], edge_samples[..., offsets_px > _Settings.beyond_blurs * blur_px]
+    )
+    return _apply_filters(rays, edge_samples / np.float32(noise), edge_filters(radius_px, blur_px), blur_px)
 
 
-def _filtered(rays: FloatArray, channels: Float32Array, both: tuple[Filters, Filters], blur_px: float) -> Limb:
+def _apply_filters(
+    rays: FloatArray, channels: Float32Array, filter_pair: tuple[Filters, Filters], blur_px: float
+) -> BallContour:
     """Apply the filters to the samples (3, n, m) of n rays, in units of the noise, the ball's own colour first."""
-    own, across = both
+    own_filters, across_filters = filter_pair
     _, count, columns = channels.shape
-    likelihood, found = (
+    likelihood, filtered = (
         np.concatenate(parts)
-        for parts in zip(own.apply(channels[0]), across.apply(channels[1:].reshape(-1, columns)), strict=True)
+        for parts in zip(
+            own_filters.apply(channels[0]), across_filters.apply(channels[1:].reshape(-1, columns)), strict=True
+        )
     )
     # Each ray's most likely texture, averaged over three neighbours, per channel (n, 3).
     texture = np.argmax(mean_of_three(likelihood.reshape(3, count, -1).swapaxes(0, 1)), axis=2)
-    found = found[np.arange(len(found)), :, texture.T.ravel()].astype(np.float64)
-    shift, widening, contrast = found.T.reshape(3, 3, count).swapaxes(1, 2)
+    filtered = filtered[np.arange(len(filtered)), :, texture.T.ravel()].astype(np.float64)
+    shift, widening, contrast = filtered.T.reshape(3, 3, count).swapaxes(1, 2)
     contrast = mean_of_three(contrast)
-    known = np.stack([own.information, across.information, across.information])[np.arange(3), :, texture]
+    known = np.stack([own_filters.information, across_filters.information, across_filters.information])[
+        np.arange(3), :, texture
+    ]
     informations = np.square(contrast) * known[..., 0]
     shifts = contrast * shift
-    widening_information = _NOTHING + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
+    widening_information = _MIN_INFORMATION + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
     wider_px = float((contrast * widening)[:, 1:].sum()) / widening_information
-    information, moved = informations.sum(axis=1), shifts.sum(axis=1)
-    mean = moved / np.maximum(information, _NOTHING)
-    least = (_Settings.worst_sigma_blurs * blur_px) ** -2
-    doubt, excess = _doubt(informations, shifts, mean, information > least)
-    information /= doubt
-    told = information > least
-    information[~told] = 1.0
-    return Limb(
+    information, weighted_shift = informations.sum(axis=1), shifts.sum(axis=1)
+    mean = weighted_shift / np.maximum(information, _MIN_INFORMATION)
+    min_information = (_Settings.worst_sigma_blurs * blur_px) ** -2
+    variance_factor, excess = _disagreement_factors(informations, shifts, mean, information > min_information)
+    information /= variance_factor
+    measured = information > min_information
+    information[~measured] = 1.0
+    return BallContour(
         rays,
-        np.where(told, mean, 0.0),
-        told / (1.0 / information + _Settings.best_sigma_px**2),
+        np.where(measured, mean, 0.0),
+        measured / (1.0 / information + _Settings.best_sigma_px**2),
         blur_px * min(max(1.0 + wider_px / blur_px, 1 / _Settings.largest_widening), _Settings.largest_widening),
         excess,
     )
 
 
-def _doubt(
-    informations: FloatArray, shifts: FloatArray, mean: FloatArray, told: NDArray[np.bool_]
+def _disagreement_factors(
+    informations: FloatArray, shifts: FloatArray, mean: FloatArray, measured: NDArray[np.bool_]
 ) -> tuple[FloatArray, float]:
-    """Return the factor on each ray's variance due to disagreeing channels, shape (n,), and `Limb.excess`.
+    """Return the factor on each ray's variance due to disagreeing channels, shape (n,), and `BallContour.excess`.
 
     Args:
         informations: inverse variances of each channel's estimate, shape (n, 3) [1/px²].
         shifts: the estimates times these, shape (n, 3) [1/px].
         mean: the combined estimate, shape (n,) [px].
-        told: mask of the rays with an estimate, shape (n,).
+        measured: mask of the rays with an estimate, shape (n,).
     """
-    off = shifts - informations * mean[:, None]
-    disagreement = mean_of_three((off * off / np.maximum(informations, _NOTHING)).sum(axis=1))
-    middle = median(disagreement[told]) if told.any() else 0.0
-    usual = max(_Settings.least_disagreement, _Settings.usual_disagreement * middle)
-    return np.maximum(1.0, disagreement / usual) ** _Settings.disagreement_power, max(1.0, middle / _Settings.of_noise)
+    deviation = shifts - informations * mean[:, None]
+    disagreement = mean_of_three((deviation * deviation / np.maximum(informations, _MIN_INFORMATION)).sum(axis=1))
+    median_disagreement = median(disagreement[measured]) if measured.any() else 0.0
+    usual = max(_Settings.min_disagreement, _Settings.usual_disagreement * median_disagreement)
+    return np.maximum(1.0, disagreement / usual) ** _Settings.disagreement_power, max(
+        1.0, median_disagreement / _Settings.of_noise
+    )
 
 
-def _own_colour_first(colour: FloatArray) -> FloatArray:
+def _colour_basis(colour: FloatArray) -> FloatArray:
     """Return an orthonormal basis of colours as rows: the ball's own, grey's part orthogonal to it, the third."""
     b, g, r = (colour / math.hypot(*colour)).tolist()
     across = [1.0 - (b + g + r) * part for part in (b, g, r)]
@@ -145,8 +155,8 @@ def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     ball, shape (3, n, columns).
     """
     on_ball = 1.4826 * median(np.abs(inside[:, 1:] - inside[:, :-1]).ravel()) / math.sqrt(2.0)
-    apart = round(1.0 / _Settings.step_px)
-    change = beyond[..., apart:] - beyond[..., :-apart]
-    rough = mean_of_three(np.einsum("cnm,cnm->n", change, change)) / (3 * change.shape[2])
-    even = int(_Settings.even_rays * (len(rough) - 1))
-    return max(_Settings.least_noise, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))
+    lag = round(1.0 / _Settings.step_px)
+    change = beyond[..., lag:] - beyond[..., :-lag]
+    variances = mean_of_three(np.einsum("cnm,cnm->n", change, change)) / (3 * change.shape[2])
+    rank = int(_Settings.even_rays * (len(variances) - 1))
+    return max(_Settings.min_noise, on_ball, math.sqrt(0.5 * float(np.partition(variances, rank)[rank])))

@@ -22,7 +22,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array
-from .settings import LimbSettings as _Settings
+from .settings import ContourSettings as _Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Filters:
         return 0.5 * (squares @ self.groups - self.log_ratio), found[:, len(self.groups) :].reshape(-1, 3, count)
 
 
-def places(radius_px: float, blur_px: float) -> FloatArray:
+def sample_offsets(radius_px: float, blur_px: float) -> FloatArray:
     """Return the sample positions along a ray, shape (m,) [px] from the outline.
 
     A small ball has fewer samples inside; a wide blur needs more on both sides.
@@ -57,12 +57,12 @@ def places(radius_px: float, blur_px: float) -> FloatArray:
     return np.arange(-inside + 0.5, outside) * _Settings.step_px
 
 
-def filters(radius_px: float, blur_px: float) -> tuple[Filters, Filters]:
-    """Return the filters along the ball's own colour and orthogonal to it, at `places(radius_px, blur_px)`.
+def edge_filters(radius_px: float, blur_px: float) -> tuple[Filters, Filters]:
+    """Return the filters along the ball's own colour and orthogonal to it, at `sample_offsets(radius_px, blur_px)`.
 
     Radius and blur are rounded to a few per cent, so that the filters of a tracked ball are computed only once.
     """
-    at = tuple(places(radius_px, blur_px).tolist())
+    at = tuple(sample_offsets(radius_px, blur_px).tolist())
     radius_px, blur_px = _rounded(radius_px, 10), _rounded(blur_px, 20)
     return _filters(at, radius_px, blur_px, True), _filters(at, radius_px, blur_px, False)
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-from .settings import LimbSettings as _Settings
+from .settings import ContourSettings as _Settings
 
 
 @dataclass(frozen=True, slots=True)
-class Waves:
+class ContourSpectrum:
     """Variances per point, in the square of the residuals' unit."""
 
     slow: float  # in the slowest waves that the fit left in
@@ -30,7 +30,7 @@ class Waves:
         """Mean of the slow and the quick waves' power, for noise that is equal in both."""
         return 0.5 * (self.slow + self.quick)
 
-    def once_round(self) -> float:
+    def once_round_variance(self) -> float:
         """Variance in the wave with one period round the outline.
 
         Pixel noise gives all waves the same power. The background of the ball disturbs whole arcs and makes the slow
@@ -40,11 +40,11 @@ class Waves:
         return (1.0 + 0.25 / self.count) ** 2 * (self.slow + max(0.0, self.slow - self.quick))
 
 
-def waves(residual: FloatArray, radius_px: float) -> Waves:
+def residual_spectrum(residual: FloatArray, radius_px: float) -> ContourSpectrum:
     """Return the waves in the residuals (n,) of an outline's points, evenly spread around it; 0 if there are none."""
     first = 2  # the fit of a circle removes the slower ones
     quickest = len(residual) // 2
-    last_slow = min(max(first + _Settings.least_waves - 1, round(radius_px / _Settings.wave_radius_px)), quickest - 1)
+    last_slow = min(max(first + _Settings.min_waves - 1, round(radius_px / _Settings.wave_radius_px)), quickest - 1)
     last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)
     squares, share, count = _band(first, last_slow, last_quick)
     parts = np.fft.rfft(residual)[first : last_quick + 1]
@@ -53,7 +53,7 @@ def waves(residual: FloatArray, radius_px: float) -> Waves:
         * np.exp(squares * (_Settings.smoothing_px / radius_px) ** 2)
         / np.count_nonzero(residual)
     )
-    return Waves(float(share @ power[: len(share)]), float(power[len(share) :].mean()), count)
+    return ContourSpectrum(float(share @ power[: len(share)]), float(power[len(share) :].mean()), count)
 
 
 @lru_cache

@@ -29,13 +29,13 @@ class StereoMatcher:
         outcomes = [self._check(one, other) for one, other in product(left, right)]
         found = _without_reflections([outcome for outcome in outcomes if isinstance(outcome, Location)])
         if len(found) == 1:
-            return found[0] if found[0].unrest < _Settings.most_unrest else Reason.OCCLUDED
+            return found[0] if found[0].roughness < _Settings.rough_limit else Reason.OCCLUDED
         if found:
             return Reason.AMBIGUOUS
         # The check that rejected the best pair.
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
-    def doubt(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
+    def ambiguity(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
         """Return the reason why the pair `found` may not be the marker, or None.
 
         Another pair, of measured or rough discs, may be the marker too, or `found` may be a mirror image of that pair.
@@ -45,13 +45,13 @@ class StereoMatcher:
             for discs, centre_px in ((left, found.centres_px[:2]), (right, found.centres_px[2:]))
         ]
         outcomes = (self._check(one, other) for one, other in product(*others))
-        fitting = [outcome for outcome in outcomes if isinstance(outcome, Location)]
-        rest = _without_reflections([found, *fitting])
+        other_pairs = [outcome for outcome in outcomes if isinstance(outcome, Location)]
+        rest = _without_reflections([found, *other_pairs])
         if not any(one is found for one in rest):
             return Reason.REFLECTION
         return Reason.AMBIGUOUS if len(rest) > 1 else None
 
-    def shows_too(
+    def may_be_second_marker(
         self, disc: Disc, others: Sequence[Disc], mask: ImageArray, found: Location, *, in_left: bool
     ) -> bool:
         """Return True if a disc of one eye may be a second marker that the other eye sees too, but not as a disc.
@@ -63,7 +63,7 @@ class StereoMatcher:
             found: the marker.
             in_left: True if `disc` is the left eye's.
         """
-        if any(self._alike(disc, other) for other in others):
+        if any(self._is_similar(disc, other) for other in others):
             return False
         radius_px = self._calibration.focal_px * self._config.radius_m / float(found.x[2])
         if disc.level < _Settings.mirrored_light * found.level and disc.radius_px < radius_px:
@@ -83,7 +83,7 @@ class StereoMatcher:
             columns = columns[np.abs(columns - own_u) > radius_px + half]
         total = np.concatenate([[0.0], np.cumsum(rows.mean(axis=0) / 255.0)])
         shares = (total[columns + half + 1] - total[columns - half]) / (2 * half + 1)
-        return bool((shares > _Settings.least_shown).any())
+        return bool((shares > _Settings.min_shown).any())
 
     def _check(self, left: Disc, right: Disc) -> Location | Reason:
         location = locate(self._calibration, self._config.radius_m, left, right)
@@ -98,13 +98,16 @@ class StereoMatcher:
         sizes: list[float] = location.sizes.tolist()
         if not self._sizes_fit(sizes, size_sigma):
             return Reason.SIZE_MISMATCH
-        apart = math.log(sizes[0] / sizes[1]) / math.hypot(size_sigma, _Settings.size_tolerance), (vl - vr) / sigma
+        disagreement = (
+            math.log(sizes[0] / sizes[1]) / math.hypot(size_sigma, _Settings.size_tolerance),
+            (vl - vr) / sigma,
+        )
         # A disturbance shifts the two eyes' centres differently: it shows in the sizes and in the rows.
         # Birge's ratio, squared, minus 1, its expectation by chance.
-        doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / len(apart) - 1.0)
-        return replace(location, cov=doubt * location.cov)
+        variance_factor = max(1.0, (disagreement[0] ** 2 + disagreement[1] ** 2) / len(disagreement) - 1.0)
+        return replace(location, cov=variance_factor * location.cov)
 
-    def _alike(self, one: Disc, other: Disc) -> bool:
+    def _is_similar(self, one: Disc, other: Disc) -> bool:
         """Return True if two discs, one of each eye, are at the same row and of the same size."""
         size = max(one.radius_px, other.radius_px) / min(one.radius_px, other.radius_px)
         rows_px = abs(float(one.centre_px[1] - other.centre_px[1]))

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .contour_fit import fit_limb
-from .contour_spectrum import waves
+from .contour_fit import fit_contour
+from .contour_spectrum import residual_spectrum
 from .polar import ball_colour, fit_circle, mean_of_three, median, rays_round, sample
-from .settings import LimbSettings
+from .settings import ContourSettings
 from .settings import OutlineSettings as _Settings
 
 BoolArray = NDArray[np.bool_]
@@ -43,9 +43,11 @@ class Outline:
     radius_sigma_px: float  # 1-sigma of the radius [px]
     visible: float  # share of the outline that is not occluded
     uneven: float  # share of the outline with a background too uneven to show the edge
-    off: float  # share of the fit's weights where the outline leaves the ellipse in whole arcs
-    unrest: float = 0.0  # deviation of the limb from the ellipse, in variances of its samples; 0 if it was not checked
-    blur_px: float = LimbSettings.usual_blur_px  # blur of the limb (1-sigma) [px]
+    outlier_share: float  # share of the fit's weights where the outline leaves the ellipse in whole arcs
+    roughness: float = (
+        0.0  # deviation of the limb from the ellipse, in variances of its samples; 0 if it was not checked
+    )
+    blur_px: float = ContourSettings.usual_blur_px  # blur of the limb (1-sigma) [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ class _Fit:
     inverse: FloatArray  # inverse normal matrix (3, 3), without the noise's variance
     residual: FloatArray  # of each ray, shape (n,) [px]
     used: FloatArray  # weight of each ray, 0..1, shape (n,)
-    apart: BoolArray  # mask (n,) of rays whose edge is too far off
+    rejected: BoolArray  # mask (n,) of rays whose edge is too far off
 
 
 def fit_outline(
@@ -93,7 +95,7 @@ def fit_outline(
             break
         if fit is not None:
             centre_px, radius_px = centre_px + shape @ fit.solution[:2], float(fit.solution[2])
-        fit, moved_px = _step(image, gate, centre_px, radius_px, shape, window_px, is_agreed=fit is not None)
+        fit, moved_px = _step(image, gate, centre_px, radius_px, shape, window_px, has_consensus=fit is not None)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
         if window_px == _Settings.wide_px:
@@ -109,7 +111,7 @@ def refine_outline(
     Args:
         blur_px: rough blur of the limb, from which the fit starts [px].
     """
-    fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape, blur_px)
+    fitted = fit_contour(image, gate, rough.centre_px, rough.radius_px, shape, blur_px)
     if fitted is None:
         return None
     if fitted.aliased:
@@ -125,7 +127,7 @@ def refine_outline(
         radius_px=fitted.radius_px,
         cov_px=cov_px,
         radius_sigma_px=fitted.radius_sigma_px,
-        unrest=fitted.unrest,
+        roughness=fitted.roughness,
         blur_px=fitted.blur_px,
     )
 
@@ -138,16 +140,16 @@ def _step(
     shape: FloatArray,
     window_px: float,
     *,
-    is_agreed: bool = False,
+    has_consensus: bool = False,
 ) -> tuple[_Fit | None, float]:
     """Fit a circle in a ring of half-width `window_px` about another one; return it and its shift [px].
 
     Args:
-        is_agreed: True if most points agree on the other circle.
+        has_consensus: True if most points agree on the other circle.
     """
     edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
-    agreed = np.array([0.0, 0.0, radius_px]) if is_agreed else None
-    fit = None if edges is None else _fit(edges, agreed)
+    consensus = np.array([0.0, 0.0, radius_px]) if has_consensus else None
+    fit = None if edges is None else _fit(edges, consensus)
     if fit is None:
         return None, math.inf
     u, v, radius = fit.solution.tolist()
@@ -171,21 +173,21 @@ def _find_edges(
     colour = ball_colour(inside, gate)
     if colour is None:
         return None
-    limb = gate.amount(inside[:, -2:])
-    level = np.maximum(mean_of_three(0.5 * (limb[:, 0] + limb[:, 1])), 0.0)
-    covered = level < _Settings.least_level * median(level)
+    rim_amount = gate.amount(inside[:, -2:])
+    level = np.maximum(mean_of_three(0.5 * (rim_amount[:, 0] + rim_amount[:, 1])), 0.0)
+    covered = level < _Settings.min_level * median(level)
     channels = np.stack(cast("list[Float32Array]", cv2.split(samples)))[..., len(inner) :]
     background = mean_of_three(channels[..., cells:].mean(axis=2).T)
-    towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
-    told = (separation > _Settings.least_separation**2) & ~covered
-    towards /= np.where(told, separation, 1.0)[:, None]
+    direction, separation = _discriminant(level, colour, background, gate.shading_sigma)
+    measured = (separation > _Settings.min_separation**2) & ~covered
+    direction /= np.where(measured, separation, 1.0)[:, None]
     # The share of ball in each sample: 1 on the ball, 0 on the background.
-    apart = (channels - background.T[..., None].astype(np.float32)) * towards.T[..., None].astype(np.float32)
-    share = apart.sum(axis=0)
-    distance = radius_px - half_px + step * share[:, :cells].sum(axis=1, dtype=np.float64)
-    unevenness_px = half_px * np.sqrt(np.square(share[:, cells:]).mean(axis=1, dtype=np.float64))
-    weight = told / (1.0 + (unevenness_px / _Settings.edge_sigma_px) ** 2)
-    return _Edges(rays, distance, weight, covered, ~told | (unevenness_px > _Settings.uneven_px))
+    projected = (channels - background.T[..., None].astype(np.float32)) * direction.T[..., None].astype(np.float32)
+    coverage = projected.sum(axis=0)
+    distance = radius_px - half_px + step * coverage[:, :cells].sum(axis=1, dtype=np.float64)
+    unevenness_px = half_px * np.sqrt(np.square(coverage[:, cells:]).mean(axis=1, dtype=np.float64))
+    weight = measured / (1.0 + (unevenness_px / _Settings.edge_sigma_px) ** 2)
+    return _Edges(rays, distance, weight, covered, ~measured | (unevenness_px > _Settings.uneven_px))
 
 
 def _discriminant(
@@ -202,71 +204,75 @@ def _discriminant(
     Returns:
         The direction in colour space (n, 3), and the squared separation along it (n,) in sigmas.
     """
-    apart = level[:, None] * colour - background
+    difference = level[:, None] * colour - background
     along = (shading_sigma * level) ** 2
     # Inverse of σ_c² I + along · colour colourᵀ by Sherman and Morrison.
-    share = along * (apart @ colour) / (_Settings.channel_sigma**2 + along * (colour @ colour))
-    direction = (apart - share[:, None] * colour) / _Settings.channel_sigma**2
-    return direction, np.einsum("nc,nc->n", direction, apart)
+    share = along * (difference @ colour) / (_Settings.channel_sigma**2 + along * (colour @ colour))
+    direction = (difference - share[:, None] * colour) / _Settings.channel_sigma**2
+    return direction, np.einsum("nc,nc->n", direction, difference)
 
 
-def _fit(edges: _Edges, agreed: FloatArray | None) -> _Fit | None:
+def _fit(edges: _Edges, consensus: FloatArray | None) -> _Fit | None:
     """Fit a circle by least squares, leaving out points that are too far off in turn.
 
     Args:
-        agreed: circle (3,) [px] that most points agree on; None to search for it.
+        consensus: circle (3,) [px] that most points agree on; None to search for it.
     """
-    weight = _agreeing(edges) if agreed is None else _near(edges, edges.distance_px - edges.rays @ agreed)
+    weight = (
+        _least_median_weights(edges)
+        if consensus is None
+        else _weights_near(edges, edges.distance_px - edges.rays @ consensus)
+    )
     fit: _Fit | None = None
     for _ in range(3):
         fitted = None if np.count_nonzero(weight) < len(weight) // 2 else fit_circle(edges.distance_px, weight)
         if fitted is None:
             return None
         residual = edges.distance_px - edges.rays @ fitted[0]
-        agreeing = _near(edges, residual)
-        fit = _Fit(edges, *fitted, residual, weight, agreeing == 0)
-        if np.array_equal(weight, agreeing):
+        inlier_weight = _weights_near(edges, residual)
+        fit = _Fit(edges, *fitted, residual, weight, inlier_weight == 0)
+        if np.array_equal(weight, inlier_weight):
             break
-        weight = agreeing
+        weight = inlier_weight
     return fit if fit is not None and fit.solution[2] > 0 else None
 
 
-def _near(edges: _Edges, residual: FloatArray) -> FloatArray:
+def _weights_near(edges: _Edges, residual: FloatArray) -> FloatArray:
     """Return the points' weights (n,), with 0 for those whose residual (n,) [px] is large for most."""
-    told = np.abs(residual[edges.weight > 0])
-    if not len(told):
+    deviations_px = np.abs(residual[edges.weight > 0])
+    if not len(deviations_px):
         return edges.weight
-    spread = 1.4826 * median(told)
-    gate = min(max(_Settings.gate_sigmas * spread, _Settings.least_gate_px), _Settings.narrow_px)
+    spread = 1.4826 * median(deviations_px)
+    gate = min(max(_Settings.gate_sigmas * spread, _Settings.min_gate_px), _Settings.narrow_px)
     return np.where(np.abs(residual) < gate, edges.weight, 0.0)
 
 
 def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
     edges, residual, radius_px = fit.edges, fit.residual, float(fit.solution[2])
-    inverse = waves(np.sqrt(fit.used) * residual, radius_px).once_round() * fit.inverse
+    inverse = residual_spectrum(np.sqrt(fit.used) * residual, radius_px).once_round_variance() * fit.inverse
     # An object in front of a ball moves its edge inwards; one of its colour behind it moves it outwards.
-    apart = fit.apart & ~edges.uneven
-    hidden = edges.covered | (apart & (residual < 0))
+    rejected = fit.rejected & ~edges.uneven
+    hidden = edges.covered | (rejected & (residual < 0))
     return Outline(
         centre_px=centre_px + shape @ fit.solution[:2],
         radius_px=radius_px,
         cov_px=shape @ inverse[:2, :2] @ shape + _Settings.floor_px**2 * np.eye(2),
         radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - np.count_nonzero(hidden) / len(hidden),
-        uneven=np.count_nonzero(edges.uneven | (apart & ~hidden)) / len(hidden),
-        off=_share_off(edges.weight, residual, max(0.35, _Settings.off_share * radius_px)),
+        uneven=np.count_nonzero(edges.uneven | (rejected & ~hidden)) / len(hidden),
+        outlier_share=_arc_outlier_share(edges.weight, residual, max(0.35, _Settings.off_share * radius_px)),
     )
 
 
-def _share_off(weight: FloatArray, residual: FloatArray, limit_px: float) -> float:
+def _arc_outlier_share(weight: FloatArray, residual: FloatArray, limit_px: float) -> float:
     """Return the share of the weights (n,) where the residuals (n,) [px], averaged over an arc, exceed edge noise.
 
     Noise and aliasing change from ray to ray; an object that covers part of the ball moves the edge in a whole arc.
     """
     half = round(len(weight) / (2 * _Settings.arcs))
     clipped = weight * np.clip(residual, -_Settings.narrow_px, _Settings.narrow_px)
-    moved, among = _arc_sums(clipped, half), _arc_sums(weight, half)
-    return float(weight @ (np.abs(moved) > limit_px * among) / weight.sum())
+    arc_residuals, arc_weights = _arc_sums(clipped, half), _arc_sums(weight, half)
+    return float(weight @ (np.abs(arc_residuals) > limit_px * arc_weights) / weight.sum())
 
 
 def _arc_sums(values: FloatArray, half: int) -> FloatArray:
@@ -275,23 +281,23 @@ def _arc_sums(values: FloatArray, half: int) -> FloatArray:
     return sums[2 * half + 1 :] - sums[: -2 * half - 1]
 
 
-def _agreeing(edges: _Edges) -> FloatArray:
+def _least_median_weights(edges: _Edges) -> FloatArray:
     """Return the points' weights (n,), with 0 for those far from the circle that most points agree on.
 
     Rousseeuw's least median of squares, over circles through the means of three arcs. Occlusions hide whole arcs, up to
     nearly half of the outline, and all of them pull inwards: plain least squares would follow them.
     """
-    told = np.flatnonzero(edges.weight > 0)
-    if len(told) < 2 * _Settings.arcs:
+    measured = np.flatnonzero(edges.weight > 0)
+    if len(measured) < 2 * _Settings.arcs:
         return edges.weight
-    points = np.column_stack([edges.rays[told], edges.distance_px[told]])
-    begins = np.arange(_Settings.arcs) * len(told) // _Settings.arcs
-    means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
-    told = told[:: max(1, len(told) // _Settings.enough_rays)]
+    points = np.column_stack([edges.rays[measured], edges.distance_px[measured]])
+    begins = np.arange(_Settings.arcs) * len(measured) // _Settings.arcs
+    means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(measured))[:, None])[_TRIPLES]
+    measured = measured[:: max(1, len(measured) // _Settings.enough_rays)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
-    off = np.abs(edges.distance_px[told] - circles @ edges.rays[told].T)
-    middle = len(told) // 2
-    spread = np.partition(off, middle, axis=1)[:, middle]
+    deviations_px = np.abs(edges.distance_px[measured] - circles @ edges.rays[measured].T)
+    middle = len(measured) // 2
+    spread = np.partition(deviations_px, middle, axis=1)[:, middle]
     best = int(np.argmin(spread))
-    gate = min(max(_Settings.gate_sigmas * 1.4826 * float(spread[best]), _Settings.least_gate_px), _Settings.narrow_px)
+    gate = min(max(_Settings.gate_sigmas * 1.4826 * float(spread[best]), _Settings.min_gate_px), _Settings.narrow_px)
     return np.where(np.abs(edges.distance_px - edges.rays @ circles[best]) < gate, edges.weight, 0.0)

@@ -54,9 +54,9 @@ def sample(
     image: Float32Array, centre_px: FloatArray, rays: FloatArray, radii: FloatArray, shape: FloatArray
 ) -> Float32Array:
     """Sample `image` on every ray (rows) and at every radius (columns) of the ellipse's own polar coordinates."""
-    at = np.multiply.outer(shape @ rays[:, :2].T, radii)
-    at += centre_px[:, None, None]
-    u, v = at.astype(np.float32)
+    positions = np.multiply.outer(shape @ rays[:, :2].T, radii)
+    positions += centre_px[:, None, None]
+    u, v = positions.astype(np.float32)
     return cast(Float32Array, cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 

@@ -36,26 +36,26 @@ class BallSize:
         """Return SIZE_MISMATCH if the size differs too much from that of the previous fixes."""
         if len(self._shares) < _Settings.fewest:
             return None
-        off, sigma = self._off(found)
-        is_other = (np.abs(off) > np.maximum(_Settings.most_sigmas * sigma, _Settings.most_off)).all()
+        error, sigma = self._size_error(found)
+        is_other = (np.abs(error) > np.maximum(_Settings.max_sigmas * sigma, _Settings.max_size_error)).all()
         return Reason.SIZE_MISMATCH if is_other else None
 
-    def doubted(self, found: Location) -> Location:
+    def with_size_error(self, found: Location) -> Location:
         """Return `found` with each centre's covariance increased by its size error beyond noise."""
-        off, sigma = self._off(found)
+        error, sigma = self._size_error(found)
         # [px²], in both directions: the direction of the shift is unknown.
-        excess = np.maximum(0.0, off**2 - (_Settings.free_sigmas * sigma) ** 2) * found.radii_px**2
+        excess = np.maximum(0.0, error**2 - (_Settings.free_sigmas * sigma) ** 2) * found.radii_px**2
         if not excess.any():
             return found
-        pulled = triangulate(self._calibration, found.centres_px, np.repeat(np.maximum(excess, 1e-12), 2))
-        return found if pulled is None else replace(found, cov=found.cov + pulled[1])
+        shifted = triangulate(self._calibration, found.centres_px, np.repeat(np.maximum(excess, 1e-12), 2))
+        return found if shifted is None else replace(found, cov=found.cov + shifted[1])
 
     def learn(self, found: Location) -> None:
         """Update the radius with the size of a fix."""
         self._shares.append((float(found.sizes.mean()), float(np.sqrt(_variances(found).mean()))))
         self._known = self._estimated()
 
-    def _off(self, found: Location) -> tuple[FloatArray, FloatArray]:
+    def _size_error(self, found: Location) -> tuple[FloatArray, FloatArray]:
         """Return each eye's relative size error, shape (2,), and its 1-sigma."""
         share, share_sigma = self._known
         return found.sizes / share - 1.0, np.sqrt(_variances(found) + share_sigma**2)

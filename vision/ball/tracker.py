@@ -22,10 +22,10 @@ from bodyschema.vision.config import LONGEST_PAUSE_S, VisionConfig
 from bodyschema.vision.image_checks import check_calibration, check_images
 from bodyschema.vision.triangulate import Location
 
-from .blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
+from .blob import Disc, Patch, Region, find_patches, measure, patch_at, rough_disc
 from .colour import gate_of
 from .match import StereoMatcher, is_reflection_of
-from .settings import LimbSettings
+from .settings import ContourSettings
 from .settings import TrackSettings as _Settings
 from .size import BallSize
 from .sphere import Pinhole
@@ -44,7 +44,7 @@ class _Track:
 
 
 @dataclass(frozen=True, slots=True)
-class _Expected:
+class _Prediction:
     """Predicted image of the tracked marker in one eye: search region, centre (2,) [px] and radius [px]."""
 
     region: Region
@@ -54,11 +54,11 @@ class _Expected:
     def fits(self, disc: Disc | Patch) -> bool:
         """Return True if a disc agrees with the prediction in this eye."""
         apart_px = max(float(np.linalg.norm(disc.centre_px - self.centre_px)), abs(disc.radius_px - self.radius_px))
-        return apart_px < _Settings.as_expected * self.radius_px
+        return apart_px < _Settings.prediction_tolerance * self.radius_px
 
 
 @dataclass(frozen=True, slots=True)
-class _Last:
+class _LastFix:
     """Last fix: time [s], position (3,) [m], level of its colour [grey levels]."""
 
     t: float
@@ -67,7 +67,7 @@ class _Last:
 
 
 @dataclass(frozen=True, slots=True)
-class _Refused:
+class _RejectedCandidate:
     """Last rejected candidate: time [s], position (3,) [m], level [grey levels], and the reason."""
 
     t: float
@@ -104,12 +104,14 @@ class StereoTracker:
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)
         self._track: _Track | None = None
-        self._last: _Last | None = None
-        self._refused: _Refused | None = None
+        self._last: _LastFix | None = None
+        self._rejected: _RejectedCandidate | None = None
         self._ambiguous_t = -math.inf
-        self._sighted: tuple[_Sighting, ...] = ()
+        self._recent_sightings: tuple[_Sighting, ...] = ()
         self._fixes = 0
-        self._blur_px = LimbSettings.usual_blur_px  # blur of the marker's contour, from its last predicted image [px]
+        self._blur_px = (
+            ContourSettings.usual_blur_px
+        )  # blur of the marker's contour, from its last predicted image [px]
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
@@ -119,35 +121,37 @@ class StereoTracker:
         """
         check_images(frame, self.calibration)
         expected = self._predicted(frame.t)
-        found = self._look(frame, *expected) if expected else None
+        found = self._search(frame, *expected) if expected else None
         if not isinstance(found, Location):
-            found = self._look(frame, None, None)
+            found = self._search(frame, None, None)
             if found is Reason.AMBIGUOUS:
                 self._ambiguous_t = frame.t
         if isinstance(found, Location):
-            found = self._doubt(frame.t, found) or found
+            found = self._contradiction(frame.t, found) or found
         if isinstance(found, Reason):
             if self._track is not None:
                 _log.debug("marker lost at %.3f s: %s", frame.t, found)
             self._track = None
             return MarkerMiss(frame.t, found)
         self._ambiguous_t = -math.inf
-        found = self._size.doubted(found)
+        found = self._size.with_size_error(found)
         self._size.learn(found)
         self._remember(frame.t, found)
-        self._follow_colour(frame, found)
+        self._adapt_colour(frame, found)
         ul, vl, ur, vr = (float(value) for value in found.centres_px)
         return MarkerFix(frame.t, frozen_array(found.x), frozen_array(found.cov), (ul, vl, ur, vr))
 
     def forget(self) -> None:
         """Search the whole images next time."""
-        self._track = self._last = self._refused = None
-        self._ambiguous_t, self._sighted = -math.inf, ()
-        self._blur_px = LimbSettings.usual_blur_px
+        self._track = self._last = self._rejected = None
+        self._ambiguous_t, self._recent_sightings = -math.inf, ()
+        self._blur_px = ContourSettings.usual_blur_px
         self._gate.reset()
         self._size.forget()
 
-    def _look(self, frame: StereoFrame, in_left: _Expected | None, in_right: _Expected | None) -> Location | Reason:
+    def _search(
+        self, frame: StereoFrame, in_left: _Prediction | None, in_right: _Prediction | None
+    ) -> Location | Reason:
         """Return the marker near its prediction, otherwise anywhere in view."""
         left_image, right_image = frame.images
         left, left_rough = self._discs(left_image, in_left)
@@ -166,14 +170,16 @@ class StereoTracker:
             answer = self._matcher.match(left, right)
         # The marker may be the one of two that could not be measured in both eyes.
         if isinstance(answer, Location):
-            answer = self._rivalry(frame, answer, lefts, rights) or answer
+            answer = self._ambiguity(frame, answer, lefts, rights) or answer
         if isinstance(answer, Reason):
-            self._sighted = tuple(self._sighting(frame.t, disc) for disc in (*lefts, *rights)) or self._sighted
+            self._recent_sightings = (
+                tuple(self._sighting(frame.t, disc) for disc in (*lefts, *rights)) or self._recent_sightings
+            )
         return answer
 
-    def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
+    def _ambiguity(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
         """Return the reason why another object in view, measured or not, may be the marker instead."""
-        reason = self._matcher.doubt(found, left, right)
+        reason = self._matcher.ambiguity(found, left, right)
         if reason is not None:
             return reason
         left_image, right_image = frame.images
@@ -183,11 +189,13 @@ class StereoTracker:
             if not rest:
                 continue
             mask = self._gate.mask(image)
-            if any(self._matcher.shows_too(disc, others, mask, found, in_left=discs is left) for disc in rest):
+            if any(
+                self._matcher.may_be_second_marker(disc, others, mask, found, in_left=discs is left) for disc in rest
+            ):
                 return Reason.AMBIGUOUS
         return None
 
-    def _discs(self, image: ImageArray, expected: _Expected | None) -> tuple[list[Disc] | Reason, list[Disc]]:
+    def _discs(self, image: ImageArray, expected: _Prediction | None) -> tuple[list[Disc] | Reason, list[Disc]]:
         """Return the discs in one eye, or the reason for none, and the round objects that could not be measured.
 
         Once a disc fits the prediction, patches that are not whole are skipped.
@@ -199,37 +207,37 @@ class StereoTracker:
         reason: Reason | None = None
         if expected is not None and not any(patch.is_whole and expected.fits(patch) for patch in patches):
             # The background of the ball has its colour, too.
-            found = self._where_expected(image, expected)
+            found = self._disc_at_prediction(image, expected)
             discs += [] if found is None else [found]
         for patch in patches:
             if any(np.linalg.norm(patch.centre_px - disc.centre_px) < disc.radius_px for disc in discs):
                 continue
             if expected is not None and not patch.is_whole and any(expected.fits(disc) for disc in discs):
                 continue
-            outcome = self._measured(image, patch, expected)
+            outcome = self._measure_patch(image, patch, expected)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
-                thing = roughly(image, patch, self._gate)
-                rough += [thing] if thing else []
+                round_object = rough_disc(image, patch, self._gate)
+                rough += [round_object] if round_object else []
             elif not any(outcome.is_same_as(disc) for disc in discs):
                 discs.append(outcome)
         return discs or reason or Reason.NO_MARKER, rough
 
-    def _where_expected(self, image: ImageArray, expected: _Expected) -> Disc | None:
+    def _disc_at_prediction(self, image: ImageArray, expected: _Prediction) -> Disc | None:
         """Return the marker if it can be measured from its predicted circle."""
         patch = patch_at(image, expected.centre_px, expected.radius_px, self._gate)
-        outcome = None if patch is None else self._measured(image, patch, expected)
+        outcome = None if patch is None else self._measure_patch(image, patch, expected)
         return outcome if isinstance(outcome, Disc) and expected.fits(outcome) else None
 
-    def _measured(self, image: ImageArray, patch: Patch, expected: _Expected | None) -> Disc | Reason:
+    def _measure_patch(self, image: ImageArray, patch: Patch, expected: _Prediction | None) -> Disc | Reason:
         """Return the ball at a patch, or the reason for none; start from its last blur if it is expected there."""
-        blur_px = LimbSettings.usual_blur_px if expected is None else self._blur_px
+        blur_px = ContourSettings.usual_blur_px if expected is None else self._blur_px
         outcome = measure(image, patch, self._eye, self._gate, self.config, blur_px)
         if isinstance(outcome, Disc) and expected is not None and expected.fits(outcome):
             self._blur_px = outcome.blur_px
         return outcome
 
-    def _predicted(self, t: float) -> tuple[_Expected, _Expected] | None:
+    def _predicted(self, t: float) -> tuple[_Prediction, _Prediction] | None:
         track = self._track
         if track is None or not 0 < t - track.t <= LONGEST_PAUSE_S:
             return None
@@ -243,7 +251,7 @@ class StereoTracker:
         left, right = (self._region(centre, half) for centre in centres)
         if left is None or right is None:
             return None
-        return _Expected(left, centres[0], track.radius_px), _Expected(right, centres[1], track.radius_px)
+        return _Prediction(left, centres[0], track.radius_px), _Prediction(right, centres[1], track.radius_px)
 
     def _region(self, centre_px: FloatArray, half_px: float) -> Region | None:
         width, height = self.calibration.image_size_px
@@ -251,31 +259,31 @@ class StereoTracker:
         high = np.clip(np.ceil(centre_px + half_px) + 1, 0, (width, height)).astype(int)
         return Region(*low.tolist(), *high.tolist()) if (high > low).all() else None
 
-    def _doubt(self, t: float, found: Location) -> Reason | None:
+    def _contradiction(self, t: float, found: Location) -> Reason | None:
         """Return the reason why the detection contradicts the recent track, or None."""
         last = self._last
         if last is None or not 0 <= t - last.t <= _Settings.longest_memory_s:
-            return self._doubt_without_track(t, found)
+            return self._contradiction_without_track(t, found)
         reason = self._size.contradicts(found)
         if reason is not None:
             return reason
-        reason = self._refused_again(t, found)
+        reason = self._rejected_again(t, found)
         if reason is None:
             is_copy = is_reflection_of(found, last.level, float(np.linalg.norm(last.x)))
-            goes_on = float(np.linalg.norm(found.x - last.x)) <= _Settings.copy_radii * self.config.radius_m
-            if self._within_reach(found.x, last.x, t - last.t) and (goes_on or not is_copy):
+            is_near_last = float(np.linalg.norm(found.x - last.x)) <= _Settings.copy_radii * self.config.radius_m
+            if self._within_reach(found.x, last.x, t - last.t) and (is_near_last or not is_copy):
                 return None
             reason = Reason.REFLECTION if is_copy else Reason.IMPLAUSIBLE_SPEED
-        self._refused = _Refused(t, found.x, found.level, reason)
+        self._rejected = _RejectedCandidate(t, found.x, found.level, reason)
         return reason
 
-    def _refused_again(self, t: float, found: Location) -> Reason | None:
+    def _rejected_again(self, t: float, found: Location) -> Reason | None:
         """Return the reason of a recent refusal if this is the same object, otherwise None."""
-        refused = self._refused
-        if refused is None or not 0 <= t - refused.t <= LONGEST_PAUSE_S:
+        rejected = self._rejected
+        if rejected is None or not 0 <= t - rejected.t <= LONGEST_PAUSE_S:
             return None
-        alike = max(found.level, refused.level) < _Settings.alike_levels * min(found.level, refused.level)
-        return refused.reason if alike and self._within_reach(found.x, refused.x, t - refused.t) else None
+        is_similar = max(found.level, rejected.level) < _Settings.level_ratio * min(found.level, rejected.level)
+        return rejected.reason if is_similar and self._within_reach(found.x, rejected.x, t - rejected.t) else None
 
     def _within_reach(self, x: FloatArray, from_x: FloatArray, seconds: float) -> bool:
         """Return True if an object can have moved from `from_x` to `x` (3,) [m] in that time."""
@@ -284,7 +292,7 @@ class StereoTracker:
         )
         return float(np.linalg.norm(x - from_x)) <= reach_m
 
-    def _doubt_without_track(self, t: float, found: Location) -> Reason | None:
+    def _contradiction_without_track(self, t: float, found: Location) -> Reason | None:
         """Return the reason why a detection without a recent track may not be the marker, or None."""
         if 0 <= t - self._ambiguous_t <= _Settings.longest_memory_s:
             # One of two similar objects has disappeared; the remaining one may be the wrong one.
@@ -292,7 +300,7 @@ class StereoTracker:
         is_copy = any(
             0 <= t - seen.t <= _Settings.longest_memory_s
             and is_reflection_of(found, seen.level, _Settings.depth_size_ratio * seen.distance_m)
-            for seen in self._sighted
+            for seen in self._recent_sightings
         )
         return Reason.REFLECTION if is_copy else None
 
@@ -305,10 +313,10 @@ class StereoTracker:
         if self._track is not None and 0 < t - self._track.t <= LONGEST_PAUSE_S:
             velocity = (found.centres_px - self._track.centres_px) / (t - self._track.t)
         radius_px = self.calibration.focal_px * self.config.radius_m / float(found.x[2])
-        self._last, self._refused = _Last(t, found.x, found.level), None
+        self._last, self._rejected = _LastFix(t, found.x, found.level), None
         self._track = _Track(t, found.centres_px, velocity, radius_px)
 
-    def _follow_colour(self, frame: StereoFrame, found: Location) -> None:
+    def _adapt_colour(self, frame: StereoFrame, found: Location) -> None:
         """At intervals, let the colour gate learn from the middle of the ball in the left image."""
         self._fixes += 1
         if self._fixes % _Settings.colour_every:
@@ -316,4 +324,4 @@ class StereoTracker:
         half = max(1.0, 0.5 * self.calibration.focal_px * self.config.radius_m / float(found.x[2]))
         middle = self._region(found.centres_px[:2], half)
         if middle is not None:
-            self._gate.follow(middle.crop(frame.left))
+            self._gate.adapt(middle.crop(frame.left))

@@ -139,7 +139,7 @@ def marker_bits(board: Board, number: int) -> FloatArray:
     return np.asarray(image > 127, dtype=np.float64)
 
 
-def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board: Board) -> str | None:
+def visible_squares(numbers: Sequence[int], corners_px: Sequence[FloatArray], board: Board) -> str | None:
     """Return None if the markers fit the board; otherwise the squares, such as 10x7, of the smallest board they fit.
 
     If they fit no board, return the squares of `board`.
@@ -151,29 +151,29 @@ def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board
     seen = np.stack(corners_px)
     if (
         max(numbers) < len(board.marker_squares)
-        and _misfit(numbers, seen, board.columns, board) < _Settings.fitting_sides
+        and _fit_error(numbers, seen, board.columns, board) < _Settings.fitting_sides
     ):
         return None
-    fits = {columns: _misfit(numbers, seen, columns, board) for columns in range(3, _Settings.most_columns + 1)}
+    fits = {columns: _fit_error(numbers, seen, columns, board) for columns in range(3, _Settings.most_columns + 1)}
     columns = min(fits, key=lambda each: fits[each])
     if fits[columns] > _Settings.fitting_sides:
         return f"{board.columns}x{board.rows}"
-    rows = max(_place(number, columns)[1] for number in numbers) + 1
+    rows = max(_square_of(number, columns)[1] for number in numbers) + 1
     return f"{columns}x{max(rows, 3)}"
 
 
-def _place(number: int, columns: int) -> tuple[int, int]:
+def _square_of(number: int, columns: int) -> tuple[int, int]:
     """Return column and row of a marker's square. Two neighbouring rows together have `columns` markers."""
     pair, rest = divmod(number, columns)
     upper = columns // 2
     return (2 * rest + 1, 2 * pair) if rest < upper else (2 * (rest - upper), 2 * pair + 1)
 
 
-def _misfit(numbers: Sequence[int], seen_px: FloatArray, columns: int, board: Board) -> float:
+def _fit_error(numbers: Sequence[int], seen_px: FloatArray, columns: int, board: Board) -> float:
     """Return the median distance of the marker corners from the best perspective image of a board, in marker sides."""
     share = board.marker_side_m / board.square_m
     square = 0.5 + 0.5 * share * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    model = np.concatenate([np.array(_place(number, columns)) + square for number in numbers])
+    model = np.concatenate([np.array(_square_of(number, columns)) + square for number in numbers])
     flat = seen_px.reshape(-1, 2)
     H, _ = cv2.findHomography(model, flat, 0)
     if H is None:

@@ -12,20 +12,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
-from .board import SIZES, Board, dictionary, smallest_size, squares_seen
-from .refine import refined
+from .board import SIZES, Board, dictionary, smallest_size, visible_squares
+from .refine import refine_corners
 from .sharpness import SharpnessSettings, blur_px, image_fault
 
 IntArray = NDArray[np.int64]
-Why = Literal[
+FaultKind = Literal[
     "dark", "over_exposed", "blurred", "mirrored", "other_dictionary", "other_pattern", "other_squares", "not_found"
 ]
 # Reasons that mean that another board is in view.
-OTHER_BOARD: tuple[Why, ...] = ("mirrored", "other_dictionary", "other_pattern", "other_squares")
+OTHER_BOARD: tuple[FaultKind, ...] = ("mirrored", "other_dictionary", "other_pattern", "other_squares")
 
 
 class _Settings:
-    least_corners = 6  # of a usable image
+    min_corners = 6  # of a usable image
     least_markers = 3  # that show which board is in view
     smallest_grid = (4, 3)  # corners of an unknown chessboard: smaller ones are found in any texture
 
@@ -60,7 +60,7 @@ class NotFound:
         text: message with a remedy.
     """
 
-    why: Why
+    why: FaultKind
     text: str
 
 
@@ -76,7 +76,7 @@ class BoardDetector:
     def find(self, image: ImageArray) -> Corners | NotFound:
         """Find the board's corners in `image`, shape (height, width, 3) BGR or (height, width)."""
         grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        found = self._plain(grey) if self._charuco is None else self._marked(grey)
+        found = self._find_chessboard(grey) if self._charuco is None else self._find_charuco(grey)
         if isinstance(found, NotFound):
             fault = image_fault(grey)
             return found if fault is None else NotFound(*fault)
@@ -86,27 +86,27 @@ class BoardDetector:
             return NotFound("blurred", text)
         return Corners(found.numbers, found.px, blur)
 
-    def _marked(self, grey: ImageArray) -> Corners | NotFound:
+    def _find_charuco(self, grey: ImageArray) -> Corners | NotFound:
         px, numbers, marker_px, marker_numbers = self._charuco.detectBoard(grey)  # pyright: ignore
         markers = [] if marker_numbers is None else [int(number) for number in np.ravel(marker_numbers)]
         if len(markers) >= _Settings.least_markers:
-            seen = squares_seen(
+            seen = visible_squares(
                 markers, [np.reshape(each, (4, 2)).astype(np.float64) for each in marker_px], self.board
             )
             if seen is not None:
-                wanted = f"{self.board.columns}x{self.board.rows}"
-                text = f"the board has {seen} squares, not {wanted}. Give --squares {seen}, or take the right board"
-                if seen == wanted:
+                expected = f"{self.board.columns}x{self.board.rows}"
+                text = f"the board has {seen} squares, not {expected}. Give --squares {seen}, or take the right board"
+                if seen == expected:
                     text = "the markers are not where this board has them: bent, or not made by this program"
                 return self._mirrored(grey, len(markers)) or NotFound("other_squares", text)
-        if numbers is None or len(numbers) < _Settings.least_corners:
-            return self._nothing(grey, len(markers))
+        if numbers is None or len(numbers) < _Settings.min_corners:
+            return self._reason_not_found(grey, len(markers))
         order = np.argsort(np.ravel(numbers))
         rough = np.ravel(numbers)[order].astype(np.int64), np.reshape(px, (-1, 2))[order].astype(np.float64)
-        found = refined(grey, self.board, *rough)
-        return Corners(*found) if len(found[0]) >= _Settings.least_corners else self._nothing(grey, len(markers))
+        found = refine_corners(grey, self.board, *rough)
+        return Corners(*found) if len(found[0]) >= _Settings.min_corners else self._reason_not_found(grey, len(markers))
 
-    def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
+    def _reason_not_found(self, grey: ImageArray, markers: int) -> NotFound:
         mirrored = self._mirrored(grey, markers)
         if mirrored is not None:
             return mirrored
@@ -114,8 +114,8 @@ class BoardDetector:
             return NotFound("not_found", f"too little of the board: {markers} of its markers. Bring it into view")
         other = self._other_dictionary(grey, self.board.dictionary_name)
         if other is not None:
-            wanted = self.board.dictionary_name
-            text = f"the markers are {other}, not {wanted}. Give --dictionary {other}, or take the right board"
+            expected = self.board.dictionary_name
+            text = f"the markers are {other}, not {expected}. Give --dictionary {other}, or take the right board"
             return NotFound("other_dictionary", text)
         squares = _plain_squares(grey)
         if squares is not None:
@@ -131,7 +131,7 @@ class BoardDetector:
             return None
         return NotFound("mirrored", "the board is mirrored: print it again as it is, or mirror the images back")
 
-    def _plain(self, grey: ImageArray) -> Corners | NotFound:
+    def _find_chessboard(self, grey: ImageArray) -> Corners | NotFound:
         size = (self.board.columns - 1, self.board.rows - 1)
         found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_ACCURACY)
         if not found:
@@ -142,30 +142,30 @@ class BoardDetector:
             # It takes five times as long as the first search.
             found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
         if not found:
-            return self._no_chessboard(grey)
+            return self._reason_no_chessboard(grey)
         return measured_grid(grey, np.reshape(px, (size[1], size[0], 2)), self.board)
 
-    def _no_chessboard(self, grey: ImageArray) -> NotFound:
-        wanted = self.board.columns, self.board.rows
-        name = "x".join(map(str, wanted))
+    def _reason_no_chessboard(self, grey: ImageArray) -> NotFound:
+        expected = self.board.columns, self.board.rows
+        name = "x".join(map(str, expected))
         squares = _plain_squares(grey)
         if squares is None:
             return NotFound("not_found", f"no chessboard of {name} squares. All of it has to be in view")
         seen = "x".join(map(str, squares))
-        if squares[0] <= max(wanted) and squares[1] <= min(wanted):
+        if squares[0] <= max(expected) and squares[1] <= min(expected):
             return NotFound("not_found", f"{seen} squares of a chessboard, not {name}. All of it has to be in view")
         text = f"the board has {seen} squares, not {name}. Give --squares {seen}, or take the right board"
         return NotFound("other_squares", text)
 
-    def _other_dictionary(self, grey: ImageArray, wanted: str | None) -> str | None:
+    def _other_dictionary(self, grey: ImageArray, expected: str | None) -> str | None:
         """Return the family of other markers in the image, if there are any.
 
         The search among a thousand words of each family takes seconds, so it comes last.
         """
-        bits = "" if wanted is None else wanted.split("_")[0]
+        bits = "" if expected is None else expected.split("_")[0]
         families = [name for name in _FAMILIES if name.split("_")[0] != bits or "APRILTAG" in name]
-        for names in self._tried(grey, families):
-            seen = {name: _markers(grey, name) for name in names if name != wanted}
+        for names in self._candidate_families(grey, families):
+            seen = {name: _markers(grey, name) for name in names if name != expected}
             best = max(seen, key=lambda name: len(seen[name]), default="")
             if best and len(seen[best]) >= _Settings.least_markers:
                 self._other_family = best
@@ -173,7 +173,7 @@ class BoardDetector:
                 return f"{bits}_{smallest_size(max(seen[best]) + 1)}" if size == str(SIZES[-1]) else best
         return None
 
-    def _tried(self, grey: ImageArray, families: Sequence[str]) -> Iterator[list[str]]:
+    def _candidate_families(self, grey: ImageArray, families: Sequence[str]) -> Iterator[list[str]]:
         """Yield families to search for: an earlier image's, then those whose first words are visible, then all."""
         if self._other_family is not None:
             yield [self._other_family]
@@ -214,9 +214,9 @@ def measured_grid(grey: ImageArray, rough_px: ArrayLike, board: Board) -> Corner
 
     They are refined if they then lie better on a plane: truncated outer squares disturb some.
     """
-    ordered = _in_order(grey, np.asarray(rough_px, dtype=np.float64), board).reshape(-1, 2)
+    ordered = _ordered(grey, np.asarray(rough_px, dtype=np.float64), board).reshape(-1, 2)
     numbers = np.arange(len(ordered))
-    kept, px = refined(grey, board, numbers, ordered)
+    kept, px = refine_corners(grey, board, numbers, ordered)
     if len(kept) < len(numbers) or _scatter(board, px) > _scatter(board, ordered):
         px = ordered
     return Corners(numbers, px)
@@ -234,7 +234,7 @@ def on_plane(board: Board, px: FloatArray) -> FloatArray:
     return np.asarray(cv2.perspectiveTransform(places[:, None], H)[:, 0], dtype=np.float64)
 
 
-def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:
+def _ordered(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:
     """Return the corners (rows, columns, 2), rotated so that the square up and left of the first one is black.
 
     If the pattern is ambiguous, the first corner is the one nearer to the image's upper left.

@@ -18,15 +18,15 @@ def page(board: Board, paper: str = "A4") -> Page:
         ConfigError: the paper is unknown, or the board does not fit on it.
     """
     width, height = (1e3 * side for side in board.size_m)
-    made = drawn_page((width, height), paper, board.name, [*_squares(board), *_markers(board)])
-    if made is None:
+    drawing = drawn_page((width, height), paper, board.name, [*_squares(board), *_markers(board)])
+    if drawing is None:
         around = Layout.around_mm
         largest = max(min((w - around) / board.columns, (h - around) / board.rows) for w, h in sheets(paper))
         raise ConfigError(
             f"{board.columns}x{board.rows} squares of {1e3 * board.square_m:g} mm with rulers do not fit on {paper}",
             remedy=f"There is room for squares of {math.floor(2 * largest) / 2:g} mm; or take larger paper",
         )
-    return made
+    return drawing
 
 
 def _squares(board: Board) -> list[Rectangle]:

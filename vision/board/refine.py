@@ -33,13 +33,13 @@ class _Settings:
     reach = 0.35  # of a square: length along the edges
     bending_steps = 2  # squares to each side: neighbourhood for the bend of the edges
     iterations, converged_px = 8, 1e-3  # at most; a step that ends them
-    most_moved = 0.2  # of a square: farther, another crossing was found
-    least_strip_px = 1.0  # half-width along an edge on which gradients count
+    max_moved = 0.2  # of a square: farther, another crossing was found
+    min_strip_px = 1.0  # half-width along an edge on which gradients count
     blurred_px = 1.5  # width of an edge, where gradients mix
-    most_reach_px = 40  # bounds the time for near boards
+    max_reach_px = 40  # bounds the time for near boards
 
 
-def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -> tuple[IntArray, FloatArray]:
+def refine_corners(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -> tuple[IntArray, FloatArray]:
     """Move the corners to the intersections of their edges, and drop those that cannot be determined.
 
     Args:
@@ -47,21 +47,21 @@ def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -
         numbers, px: rough corners, shapes (n,) and (n, 2).
     """
     levels = np.asarray(grey, dtype=np.float64)
-    both = [cv2.Scharr(levels, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))]
-    slopes = np.asarray(np.stack(both, axis=-1) / 32.0, dtype=np.float64)
-    frames = _frames(board, numbers, px)
+    gradients = [cv2.Scharr(levels, cv2.CV_64F, *axis) for axis in ((1, 0), (0, 1))]
+    slopes = np.asarray(np.stack(gradients, axis=-1) / 32.0, dtype=np.float64)
+    frames = _square_axes(board, numbers, px)
     usable = np.isfinite(frames).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(frames))) > 1.0)
     bends = _bends(board, numbers, px)[usable]
     numbers, px, frames = numbers[usable], px[usable], frames[usable]
-    moved = _crossings(slopes, px, frames, bends, board)
+    moved = _edge_crossings(slopes, px, frames, bends, board)
     squares = np.linalg.norm(np.linalg.solve(frames, (moved - px)[..., None])[..., 0], axis=1)
     size = np.array([levels.shape[1], levels.shape[0]])
     inside = ((moved > _Settings.blurred_px) & (moved < size - 1 - _Settings.blurred_px)).all(axis=1)
-    kept = inside & (squares < _Settings.most_moved)
+    kept = inside & (squares < _Settings.max_moved)
     return numbers[kept], moved[kept]
 
 
-def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
+def _square_axes(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
     """Return the image of one square to the right and one down at each corner, as columns, shape (n, 2, 2) [px].
 
     NaN where it cannot be determined.
@@ -101,16 +101,16 @@ def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
         near = places[:, None] + offsets
         seen = grid[near[..., 0], near[..., 1]]
         known = np.isfinite(seen[..., 0])
-        told = known.sum(axis=1) >= 3
-        weighed = powers * known[told, :, None]
-        normal = np.einsum("nki,kj->nij", weighed, powers)
+        determined = known.sum(axis=1) >= 3
+        weighted = powers * known[determined, :, None]
+        normal = np.einsum("nki,kj->nij", weighted, powers)
         # Relative to the corner itself, to keep the digits.
-        moments = np.einsum("nki,nkj->nij", weighed, np.nan_to_num(seen[told] - px[told, None]))
-        bends[told, :, axis] = np.linalg.solve(normal, moments)[:, 2]
+        moments = np.einsum("nki,nkj->nij", weighted, np.nan_to_num(seen[determined] - px[determined, None]))
+        bends[determined, :, axis] = np.linalg.solve(normal, moments)[:, 2]
     return bends
 
 
-def _crossings(
+def _edge_crossings(
     slopes: FloatArray, start: FloatArray, frames: FloatArray, bends: FloatArray, board: Board
 ) -> FloatArray:
     """Return the intersections of the edges near `start`, shape (n, 2) [px]; NaN if undetermined."""
@@ -120,36 +120,34 @@ def _crossings(
     squares_a_px = np.linalg.norm(into_squares, axis=2)
     strip_px = strip / squares_a_px
     half_widths = (
-        np.maximum(strip_px - _Settings.blurred_px, np.minimum(strip_px, _Settings.least_strip_px)) * squares_a_px
+        np.maximum(strip_px - _Settings.blurred_px, np.minimum(strip_px, _Settings.min_strip_px)) * squares_a_px
     )
     half_widths = np.minimum(half_widths, _Settings.reach)  # a plain square may be truncated a little farther out
-    reach = min(
-        int(np.ceil(_Settings.reach * np.abs(frames).sum(axis=2).max(initial=0.0))) + 1, _Settings.most_reach_px
-    )
+    reach = min(int(np.ceil(_Settings.reach * np.abs(frames).sum(axis=2).max(initial=0.0))) + 1, _Settings.max_reach_px)
     window = np.stack(np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)), axis=-1).reshape(-1, 2)
     padded = np.pad(slopes, ((reach, reach), (reach, reach), (0, 0)))
     limits = np.array([slopes.shape[1], slopes.shape[0]]) - 1
-    at = start
+    positions = start
     for _ in range(_Settings.iterations):
-        middle = np.clip(np.nan_to_num(np.rint(at)), 0, limits).astype(int)
-        p = (middle[:, None] + window) - at[:, None]
+        middle = np.clip(np.nan_to_num(np.rint(positions)), 0, limits).astype(int)
+        p = (middle[:, None] + window) - positions[:, None]
         pixels = middle[:, None] + window + reach
         g = padded[pixels[..., 1], pixels[..., 0]]
         squares = p @ into_squares.mT
         weights = _cross(np.abs(squares), half_widths[:, None])
-        weighed = g * weights[..., None]
-        G = weighed.mT @ g
+        weighted = g * weights[..., None]
+        G = weighted.mT @ g
         # Edges of a single direction do not determine an intersection.
-        told = np.linalg.cond(G) < 1.0 / np.finfo(np.float64).eps
+        determined = np.linalg.cond(G) < 1.0 / np.finfo(np.float64).eps
         # The tangent of an edge that has deviated by b passes the corner at -b.
         tangents = p + squares**2 @ bends.mT
-        h = weighed.mT @ np.einsum("nki,nki->nk", g, tangents)[..., None]
-        step = np.full_like(at, np.nan)
-        step[told] = np.linalg.solve(G[told], h[told])[..., 0]
-        at = at + step
+        h = weighted.mT @ np.einsum("nki,nki->nk", g, tangents)[..., None]
+        step = np.full_like(positions, np.nan)
+        step[determined] = np.linalg.solve(G[determined], h[determined])[..., 0]
+        positions = positions + step
         if np.nanmax(np.abs(step), initial=0.0) < _Settings.converged_px:
             break
-    return at
+    return positions
 
 
 def _cross(squares: FloatArray, half_widths: FloatArray) -> FloatArray:

@@ -28,10 +28,10 @@ def blur_px(grey: ImageArray, board: Board, numbers: NDArray[np.int64], px: Floa
         grey: the image, shape (height, width).
         numbers, px: the detected corners, shapes (n,) and (n, 2).
     """
-    return max(_across(grey, numbers, px, board, step) for step in (1, board.columns - 1))
+    return max(_edge_blur_px(grey, numbers, px, board, step) for step in (1, board.columns - 1))
 
 
-def _across(grey: ImageArray, numbers: NDArray[np.int64], px: FloatArray, board: Board, step: int) -> float:
+def _edge_blur_px(grey: ImageArray, numbers: NDArray[np.int64], px: FloatArray, board: Board, step: int) -> float:
     place = {int(number): k for k, number in enumerate(numbers)}
     width = board.columns - 1
     pairs = [

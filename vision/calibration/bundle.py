@@ -75,19 +75,21 @@ def solve(
     Raises:
         CalibrationError: the views do not determine the parameters.
     """
-    weighed = tuple(np.ones(view.corner_count) for view in views) if weights is None else tuple(weights)
+    corner_weights = tuple(np.ones(view.corner_count) for view in views) if weights is None else tuple(weights)
     prior = np.zeros(len(vector)) if prior is None else prior
 
     def stepped(now: Linear, damping: float) -> Linear | None:
         step = now.step(damping)
         if step is None:
             return None
-        return _linearised(views, corners_m, model, now.vector + step[0], now.poses + step[1], weighed, prior)
+        return _linearised(views, corners_m, model, now.vector + step[0], now.poses + step[1], corner_weights, prior)
 
-    linear = minimised(_linearised(views, corners_m, model, vector, poses, weighed, prior), stepped)
+    linear = minimised(_linearised(views, corners_m, model, vector, poses, corner_weights, prior), stepped)
     if not np.isfinite(linear.squares):
         raise CalibrationError(UNDETERMINED)
-    return Bundle(model, linear.vector, linear.poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0], prior)
+    return Bundle(
+        model, linear.vector, linear.poses, tuple(linear.residuals), corner_weights, linear.reduced(0.0)[0], prior
+    )
 
 
 def view_residuals(
@@ -108,7 +110,7 @@ def view_residuals(
     return minimised(_linearised([view], corners_m, model, vector, start[None], [weights]), stepped).residuals[0]
 
 
-def seen_with_slopes(
+def residuals_and_jacobian(
     view: View, corners_m: FloatArray, lenses: Sequence[Lens], right_eye: FloatArray, pose: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return a view's residuals (corners, 2) [px] and the Jacobian of the prediction (2 corners, p + 6).
@@ -140,7 +142,7 @@ def seen_with_slopes(
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
-def lenses_and_rest(model: Model, vector: FloatArray) -> tuple[tuple[Lens, ...], FloatArray]:
+def split_lenses(model: Model, vector: FloatArray) -> tuple[tuple[Lens, ...], FloatArray]:
     """Return the lenses in the rig's vector, and the values behind them."""
     lenses = lenses_of(model, vector)
     return lenses, vector[len(lenses) * len(lenses[0].vector) :]
@@ -178,10 +180,10 @@ class Linear:
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return normal matrix and gradient of the rig with the poses eliminated, and the poses' normal matrices."""
         poses = self.pose_normals + damping * self.pose_normals * np.eye(POSE)
-        weighed = np.linalg.solve(poses, np.transpose(self.mixed, (0, 2, 1)))
+        eliminated = np.linalg.solve(poses, np.transpose(self.mixed, (0, 2, 1)))
         normal = self.normal + damping * np.diag(np.diag(self.normal))
-        normal = normal - np.tensordot(self.mixed, weighed, axes=([0, 2], [0, 1]))
-        gradient = self.gradient - np.tensordot(weighed, self.pose_gradients, axes=([0, 1], [0, 1]))
+        normal = normal - np.tensordot(self.mixed, eliminated, axes=([0, 2], [0, 1]))
+        gradient = self.gradient - np.tensordot(eliminated, self.pose_gradients, axes=([0, 1], [0, 1]))
         return normal, gradient, poses
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
@@ -192,8 +194,8 @@ class Linear:
                 return None
             scale = 1.0 / np.sqrt(np.diag(normal))
             rig = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)
-            left = self.pose_gradients - np.einsum("vij,i->vj", self.mixed, rig)
-            return rig, np.linalg.solve(poses, left[..., None])[..., 0]
+            remaining = self.pose_gradients - np.einsum("vij,i->vj", self.mixed, rig)
+            return rig, np.linalg.solve(poses, remaining[..., None])[..., 0]
         except np.linalg.LinAlgError:
             return None
 
@@ -226,9 +228,9 @@ def _linearised(
         np.zeros((m, p, 6)),
         float(known @ vector**2),
     )
-    lenses, right_eye = lenses_and_rest(model, vector)
+    lenses, right_eye = split_lenses(model, vector)
     for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
-        residual, J = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
+        residual, J = residuals_and_jacobian(view, corners_m, lenses, right_eye, pose)
         rows = np.column_stack([J, residual.ravel()])
         products = rows.T @ (np.repeat(weights[k], 2)[:, None] * rows)
         linear.normal += products[:p, :p]

@@ -13,17 +13,25 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
 from bodyschema.vision.rig.lens import DISTORTION_NAMES, Model
-from bodyschema.vision.rig.stereo_rig import CalibrationError, Made, OneEyeRig, Rig, StereoRig, lenses_of, split
+from bodyschema.vision.rig.stereo_rig import (
+    CalibrationError,
+    CalibrationProvenance,
+    OneEyeRig,
+    Rig,
+    StereoRig,
+    lenses_of,
+    split,
+)
 
 from .bundle import Bundle, solve
 from .guidance import Coverage
 from .held_out import HeldOut, covariance, held_out
+from .initial_estimate import start
 from .refocus import focal_spread, refocused
-from .requirements import contradicts, lacking, misplaced, together, unsure
+from .requirements import baseline_contradiction, join_reasons, misplacement, undetermined, unmet_requirements
 from .settings import FitSettings as _Settings
-from .start import start
 from .view import EYES, ONE_EYE, Eye, View
-from .weights import weighed
+from .weights import refit_weighted
 
 ModelChoice = Literal["auto", "pinhole", "fisheye", "rational"]
 
@@ -33,7 +41,7 @@ _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
 @dataclass(frozen=True)
-class Asked:
+class CalibrationRequest:
     """Request for a calibration."""
 
     # image_size_px, serials: of the eyes
@@ -77,53 +85,57 @@ class Calibrated:
     rig: Rig  # the calibration
     board: Board
     fitted: Fitted  # the selected model
-    rivals_px: dict[Model, float]  # held-out error of each candidate model that fits the cameras [px]
+    held_out_by_model_px: dict[Model, float]  # held-out error of each candidate model that fits the cameras [px]
     coverage: Coverage  # image coverage of the views
     # relative 1-sigma of the focal lengths over the views; None without evidence that a lens refocused
     focal_spread: float | None
 
 
 def calibrate(
-    views: Sequence[View], board: Board, asked: Asked, tell: Callable[[str], None] = lambda _: None
+    views: Sequence[View], board: Board, request: CalibrationRequest, tell: Callable[[str], None] = lambda _: None
 ) -> Calibrated:
     """Calibrate the lenses and poses of two cameras, or the lens of one.
 
     Raises:
         CalibrationError: the result is not good enough; the message says why.
     """
-    coverage = Coverage.of(views, board, asked.image_size_px, asked.eyes)
-    if reasons := lacking(coverage):
-        raise CalibrationError(together(reasons))
-    models: tuple[Model, ...] = tuple(DISTORTION_NAMES) if asked.model == "auto" else (asked.model,)
-    fits = _fits(views, board, asked, models, tell)
-    model = _chosen(fits)
-    rig = _rig(fits[model], board, asked)
-    reasons = unsure(rig)
+    coverage = Coverage.of(views, board, request.image_size_px, request.eyes)
+    if reasons := unmet_requirements(coverage):
+        raise CalibrationError(join_reasons(reasons))
+    models: tuple[Model, ...] = tuple(DISTORTION_NAMES) if request.model == "auto" else (request.model,)
+    fits = _fit_models(views, board, request, models, tell)
+    model = _select_model(fits)
+    rig = _rig(fits[model], board, request)
+    reasons = undetermined(rig)
     if (
-        asked.baseline_m is not None
+        request.baseline_m is not None
         and isinstance(rig, StereoRig)
-        and (reason := contradicts(rig, asked.baseline_m)) is not None
+        and (reason := baseline_contradiction(rig, request.baseline_m)) is not None
     ):
         reasons.append(reason)
     spread = focal_spread(fits[model].views, board.corners_m, fits[model].bundle)
     if reasons:
-        raise CalibrationError(together(reasons if spread is None else [refocused(spread), *reasons]))
+        raise CalibrationError(join_reasons(reasons if spread is None else [refocused(spread), *reasons]))
     rivals: dict[Model, float] = {each: found.held_out.rms_px for each, found in fits.items()}
     return Calibrated(rig, board, fits[model], rivals, coverage, spread)
 
 
-def _fits(
-    views: Sequence[View], board: Board, asked: Asked, models: Sequence[Model], tell: Callable[[str], None]
+def _fit_models(
+    views: Sequence[View],
+    board: Board,
+    request: CalibrationRequest,
+    models: Sequence[Model],
+    tell: Callable[[str], None],
 ) -> dict[Model, Fitted]:
     """Fit each model and return those that fit; raise CalibrationError if none does."""
     fits: dict[Model, Fitted] = {}
     refusals: dict[Model, CalibrationError] = {}
     for model in models:
-        if model == "rational" and fits and _chosen(fits) == "pinhole":
+        if model == "rational" and fits and _select_model(fits) == "pinhole":
             continue  # it differs from pinhole at wide angles, where fisheye is better too
         tell(f"fitting {model} lenses to {len(views)} views")
         try:
-            fits[model] = fit(views, board.corners_m, asked.image_size_px, model, asked.eyes)
+            fits[model] = fit(views, board.corners_m, request.image_size_px, model, request.eyes)
         except CalibrationError as error:
             if len(models) > 1:
                 tell(f"{model} lenses do not fit: {error}")
@@ -134,7 +146,7 @@ def _fits(
     # An unsuitable model may misplace the eyes: a cause is certain only if all models agree on it.
     if len({_NUMBERS.sub("", str(each)) for each in (first, *others)}) == 1:
         raise first
-    raise CalibrationError(together([f"{model} lenses: {error}" for model, error in refusals.items()]))
+    raise CalibrationError(join_reasons([f"{model} lenses: {error}" for model, error in refusals.items()]))
 
 
 def fit(
@@ -171,13 +183,13 @@ def _fit(
     left_out: list[LeftOut] = []
     vector, poses = start(kept, corners_m, image_size_px, model, eyes)
     while True:
-        bundle = weighed(kept, corners_m, solve(kept, corners_m, model, vector, poses))
+        bundle = refit_weighted(kept, corners_m, solve(kept, corners_m, model, vector, poses))
         worst = _outlier(bundle.view_rms_px())
         if worst is None:
             break
         rms = bundle.view_rms_px()
         left_out.append(LeftOut(kept.pop(worst).name, float(rms[worst]), float(np.median(rms))))
-        if len(left_out) > _Settings.most_left_out * len(views):
+        if len(left_out) > _Settings.max_left_out * len(views):
             if (spread := focal_spread(kept, corners_m, solve(kept, corners_m, model, vector, poses))) is not None:
                 raise CalibrationError(refocused(spread))
             raise CalibrationError(
@@ -186,9 +198,9 @@ def _fit(
                 "instant?"
             )
         vector, poses = bundle.vector, np.delete(bundle.poses, worst, axis=0)
-    _require_places(model, bundle.vector)
+    _require_placement(model, bundle.vector)
     if not _is_one_to_one(bundle, image_size_px):
-        bundle = _stiffened(kept, corners_m, bundle, image_size_px)
+        bundle = _refit_with_prior(kept, corners_m, bundle, image_size_px)
     return Fitted(tuple(kept), tuple(left_out), bundle, held_out(kept, corners_m, bundle))
 
 
@@ -196,7 +208,9 @@ def _is_one_to_one(bundle: Bundle, image_size_px: tuple[int, int]) -> bool:
     return all(lens.is_one_to_one(image_size_px) for lens in lenses_of(bundle.model, bundle.vector))
 
 
-def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, image_size_px: tuple[int, int]) -> Bundle:
+def _refit_with_prior(
+    views: Sequence[View], corners_m: FloatArray, bundle: Bundle, image_size_px: tuple[int, int]
+) -> Bundle:
     """Refit a lens that folds over, with a prior that keeps the steepest term of its polynomial small.
 
     A narrow lens hardly determines that term, so it may fold the image over where the board was never seen.
@@ -210,22 +224,22 @@ def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, ima
         prior[last] = (bundle.sigma_px * corner ** _STEEPEST_POWER[bundle.model] / _Settings.steepest_term) ** 2
         vector[last] = 0.0
     stiff = solve(views, corners_m, bundle.model, vector, bundle.poses, bundle.weights, prior)
-    return weighed(views, corners_m, stiff)
+    return refit_weighted(views, corners_m, stiff)
 
 
-def _chosen(fits: dict[Model, Fitted]) -> Model:
+def _select_model(fits: dict[Model, Fitted]) -> Model:
     """Select the simplest model, unless a later one predicts the views shared by both fits clearly better."""
     best, *others = fits
     for model in others:
         shared = {view.name for view in fits[best].views} & {view.name for view in fits[model].views}
-        if _of(fits[model], shared).is_better_than(_of(fits[best], shared)):
+        if _subset(fits[model], shared).is_better_than(_subset(fits[best], shared)):
             best = model
     return best
 
 
-def _of(fitted: Fitted, names: set[str]) -> HeldOut:
-    among = np.array([view.name in names for view in fitted.views])
-    return HeldOut(fitted.held_out.squares[among], fitted.held_out.freedom[among])
+def _subset(fitted: Fitted, names: set[str]) -> HeldOut:
+    is_shared = np.array([view.name in names for view in fitted.views])
+    return HeldOut(fitted.held_out.squares[is_shared], fitted.held_out.freedom[is_shared])
 
 
 def _outlier(rms_px: FloatArray) -> int | None:
@@ -236,32 +250,34 @@ def _outlier(rms_px: FloatArray) -> int | None:
     return worst if rms_px[worst] > usual + _Settings.outlier_spreads * spread else None
 
 
-def _require_places(model: Model, vector: FloatArray) -> None:
+def _require_placement(model: Model, vector: FloatArray) -> None:
     if len(lenses_of(model, vector)) == 1:
         return
     _, _, rotation, translation = split(model, vector)
-    reason = misplaced(np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64), translation)
+    reason = misplacement(np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64), translation)
     if reason is not None:
         raise CalibrationError(reason)
 
 
-def _rig(fitted: Fitted, board: Board, asked: Asked) -> Rig:
+def _rig(fitted: Fitted, board: Board, request: CalibrationRequest) -> Rig:
     bundle = fitted.bundle
-    unsure_by = covariance(fitted.views, board.corners_m, bundle)
-    made = Made(
-        date=asked.date,
+    parameter_covariance = covariance(fitted.views, board.corners_m, bundle)
+    provenance = CalibrationProvenance(
+        date=request.date,
         board=board.name,
         views=len(fitted.views),
         left_out=len(fitted.left_out),
         reprojection_px=bundle.sigma_px,
         held_out_px=fitted.held_out.rms_px,
-        scale_sigma=asked.scale_sigma,
+        scale_sigma=request.scale_sigma,
     )
     lenses = lenses_of(bundle.model, bundle.vector)
     if len(lenses) == 1:
-        return OneEyeRig(lenses[0], asked.image_size_px, (asked.serials[0],), unsure_by, made)
+        return OneEyeRig(lenses[0], request.image_size_px, (request.serials[0],), parameter_covariance, provenance)
     left, right, rotation, translation = split(bundle.model, bundle.vector)
     # An error of the board's size only scales all lengths.
-    unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
-    serials = asked.serials[0], asked.serials[1]
-    return StereoRig(left, right, rotation, translation, asked.image_size_px, serials, unsure_by, made)
+    parameter_covariance[-3:, -3:] += request.scale_sigma**2 * np.outer(translation, translation)
+    serials = request.serials[0], request.serials[1]
+    return StereoRig(
+        left, right, rotation, translation, request.image_size_px, serials, parameter_covariance, provenance
+    )

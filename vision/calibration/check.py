@@ -18,7 +18,7 @@ from .view import View
 class _Settings:
     """Settings of the check: how much may change without a warning."""
 
-    least_corners, sigmas = 8, 4.0  # corners that both eyes see; multiple of the uncertainty
+    min_corners, sigmas = 8, 4.0  # corners that both eyes see; multiple of the uncertainty
     # Drift allowed for focus, temperature and a bent board, beyond the covariance: of rows, and of a square's size.
     free_rows_px, free_square = 0.15, 0.002
     step_px = 1e-3  # for derivatives
@@ -58,25 +58,25 @@ def check(rig: StereoRig, view: View, board: Board) -> Check:
         CalibrationError: one of the eyes does not see enough of the board.
     """
     numbers, left, right = _shared(view)
-    if len(numbers) < (least := _Settings.least_corners):
+    if len(numbers) < (needed := _Settings.min_corners):
         raise CalibrationError(
-            f"both eyes see {len(numbers)} corners of the board, at least {least} are needed. Hold it into the "
+            f"both eyes see {len(numbers)} corners of the board, at least {needed} are needed. Hold it into the "
             "middle of both images"
         )
     model = board.corners_m[numbers]
     covariance = covariance_of(rig, lambda other: _figures(other, left, right, model))
-    covariance = covariance + rig.made.held_out_px**2 * _noise(rig, left, right, model)
+    covariance = covariance + rig.provenance.held_out_px**2 * _noise_covariance(rig, left, right, model)
     # From focal lengths, radians and shares to display units.
     focal = Rectification(rig).calibration.focal_px
     units = np.array([focal, np.degrees(1.0), board.square_m])
     found = units * _figures(rig, left, right, model)
     sigma = units * np.sqrt(np.diag(covariance))
-    wrong = _wrong(found, sigma, focal, rig.image_size_px[0], board.square_m)
-    if wrong and (misplaced := _misplaced(rig, left, right, model)) is not None:
-        wrong = [misplaced]
+    wrong = _violations(found, sigma, focal, rig.image_size_px[0], board.square_m)
+    if wrong and (misplacement := _misplacement(rig, left, right, model)) is not None:
+        wrong = [misplacement]
     return Check(
         len(numbers),
-        focal * _rows_apart(rig, left, right),
+        focal * _rms_row_difference(rig, left, right),
         *(float(each) for pair in zip(found, sigma, strict=True) for each in pair),
         nominal_m=board.square_m,
         wrong=tuple(wrong),
@@ -91,7 +91,7 @@ def _shared(view: View) -> tuple[np.ndarray, FloatArray, FloatArray]:
     return numbers, view.left.px[a], view.right.px[b]
 
 
-def _rows(rig: StereoRig, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _row_differences(rig: StereoRig, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the right image's row minus the left one's for each corner, and the position along the row [focal
     lengths].
     """
@@ -100,12 +100,12 @@ def _rows(rig: StereoRig, left: FloatArray, right: FloatArray) -> tuple[FloatArr
     return there[:, 1] - here[:, 1], there[:, 0]
 
 
-def _rows_apart(rig: StereoRig, left: FloatArray, right: FloatArray) -> float:
+def _rms_row_difference(rig: StereoRig, left: FloatArray, right: FloatArray) -> float:
     """Return the RMS difference of the rows, in focal lengths."""
-    return float(np.sqrt(np.mean(_rows(rig, left, right)[0] ** 2)))
+    return float(np.sqrt(np.mean(_row_differences(rig, left, right)[0] ** 2)))
 
 
-def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> str | None:
+def _misplacement(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> str | None:
     """Return a message if the calibration would hold for images exchanged or turned upside down, else None."""
     turned_left, turned_right = (np.array(rig.image_size_px) - 1.0 - px for px in (left, right))
     placed = (
@@ -114,23 +114,23 @@ def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: Float
         ("the right image is upside down: turn that camera, or its images", left, turned_right),
         ("both images are upside down: turn both cameras, or their images", turned_left, turned_right),
     )
-    most = _Settings.misplaced_rows * _rows_apart(rig, left, right)
+    max_difference = _Settings.misplaced_rows * _rms_row_difference(rig, left, right)
     for text, one, other in placed:
         size = _figures(rig, one, other, model)[2]
-        if _rows_apart(rig, one, other) < most and abs(size - 1.0) < _Settings.misplaced_size:
+        if _rms_row_difference(rig, one, other) < max_difference and abs(size - 1.0) < _Settings.misplaced_size:
             return text
     return None
 
 
 def _figures(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
     """Return the mean row difference, its slope along the rows [rad], and the ratio of measured to true board size."""
-    rows, at = _rows(rig, left, right)
+    rows, at = _row_differences(rig, left, right)
     along = at - at.mean()
     seen, true = pdist(triangulated(rig, left, right)), pdist(model)
     return np.array([rows.mean(), along @ rows / (along @ along), seen @ true / (true @ true)])
 
 
-def _noise(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
+def _noise_covariance(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArray) -> FloatArray:
     """Return the covariance of the figures for noise of 1 px in every image coordinate."""
     px = np.concatenate([left, right])
     slopes = []
@@ -142,12 +142,12 @@ def _noise(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArra
     return J.T @ J
 
 
-def _wrong(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int, nominal_m: float) -> list[str]:
+def _violations(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int, nominal_m: float) -> list[str]:
     rows_px, roll_deg, square_m = found.tolist()
-    free = np.array(
+    tolerance = np.array(
         [_Settings.free_rows_px, np.degrees(4.0 * _Settings.free_rows_px / width_px), _Settings.free_square * nominal_m]
     )
-    off = np.abs(found - np.array([0.0, 0.0, nominal_m])) > _Settings.sigmas * sigma + free
+    exceeds = np.abs(found - np.array([0.0, 0.0, nominal_m])) > _Settings.sigmas * sigma + tolerance
     texts = (
         f"rows are {rows_px:+.2f} px apart: a camera has been turned up or down by "
         f"{np.degrees(abs(rows_px) / focal_px):.2f}°",
@@ -155,9 +155,9 @@ def _wrong(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int,
         f"a square of {1e3 * nominal_m:g} mm is measured as {1e3 * square_m:.2f} mm: a camera has been turned inwards "
         f"or outwards, moved or refocused, or the board is another one, or printed at {square_m / nominal_m:.1%}",
     )
-    wrong = [text for text, is_off in zip(texts, off, strict=True) if is_off]
+    wrong = [text for text, is_off in zip(texts, exceeds, strict=True) if is_off]
     return (
         [*wrong, "all at once, so that these may be other cameras than those that were calibrated"]
-        if off.all()
+        if exceeds.all()
         else wrong
     )

@@ -74,7 +74,7 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
     detector = BoardDetector(board)
     found = Gathered(board)
     for number, pair in enumerate(pairs, start=1):
-        view, unusable = looked_at(pair, detector)
+        view, unusable = find_board(pair, detector)
         found.image_size_px, found.eyes = pair.size_px, eyes_of(pair)
         found.unusable += unusable
         if view.left is not None or view.right is not None:
@@ -87,19 +87,19 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
             break
         if number % _Settings.told_pairs == 0:
             tell(f"{number} pairs looked at; the board is in {len(found.views)}")
-    for line in summarised(found.unusable, found.eyes):
+    for line in summary_lines(found.unusable, found.eyes):
         tell(line)
     return found
 
 
-def summarised(unusable: Sequence[Unusable], eyes: Sequence[Eye] = EYES) -> list[str]:
+def summary_lines(unusable: Sequence[Unusable], eyes: Sequence[Eye] = EYES) -> list[str]:
     """Return one line for each eye and reason with the unusable images; differences in numbers are ignored."""
-    alike: dict[tuple[Eye, str], list[Unusable]] = {}
+    by_kind: dict[tuple[Eye, str], list[Unusable]] = {}
     for each in unusable:
-        alike.setdefault((each.eye, _kind(each)), []).append(each)
+        by_kind.setdefault((each.eye, _kind(each)), []).append(each)
     return [
         f"{_named(group)}{f', {eye} image' if len(eyes) > 1 else ''}: {_usual([each.fault.text for each in group])}"
-        for (eye, _), group in alike.items()
+        for (eye, _), group in by_kind.items()
     ]
 
 
@@ -123,7 +123,7 @@ def eyes_of(pair: ImagePair) -> tuple[Eye, ...]:
     return ONE_EYE if pair.right is None else EYES
 
 
-def looked_at(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable, ...]]:
+def find_board(pair: ImagePair, detector: Detector) -> tuple[View, tuple[Unusable, ...]]:
     """Find the board's corners in a pair of images, with the reason for each eye without corners.
 
     Raises:
@@ -150,6 +150,6 @@ def require_both(found: Gathered) -> None:
         return
     faults = [each for each in found.unusable if each.eye in blind]
     kind = _usual([_kind(each) for each in faults])
-    alike = [each.fault.text for each in faults if _kind(each) == kind]
+    by_kind = [each.fault.text for each in faults if _kind(each) == kind]
     who = "no image" if len(blind) == len(found.eyes) else f"no {image_of(blind[0], found.eyes)}"
-    raise CalibrationError(f"{who} shows a board that can be used; {len(alike)} of {len(faults)}: {_usual(alike)}")
+    raise CalibrationError(f"{who} shows a board that can be used; {len(by_kind)} of {len(faults)}: {_usual(by_kind)}")

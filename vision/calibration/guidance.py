@@ -13,8 +13,8 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board, Corners
 from bodyschema.vision.rig.lens import Lens
 
+from .initial_estimate import pose_of
 from .settings import ViewSettings as _Settings
-from .start import pose_of
 from .view import EYES, Eye, View, all_px, image_of, seen_by
 
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
@@ -62,19 +62,19 @@ class Coverage:
     def progress(self) -> float:
         """Fraction of the wanted coverage reached, 0 to 1."""
         wanted = len(self.tilted()) + len(self.eyes) * GRID[0] * GRID[1] + 2 + _Settings.wanted_views
-        lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
-        return 1.0 - (lacking + max(_Settings.wanted_views - self.whole_views, 0)) / wanted
+        missing_count = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
+        return 1.0 - (missing_count + max(_Settings.wanted_views - self.whole_views, 0)) / wanted
 
     def tilted(self) -> dict[str, int]:
         """Return the number of views in which each edge of the board is farther away than the opposite one."""
         about_upright, about_level = self.tilts_deg[:, 0], self.tilts_deg[:, 1]
-        ways = {
+        tilted_by_edge = {
             "right": about_upright > _Settings.tilt_deg,
             "left": about_upright < -_Settings.tilt_deg,
             "lower": about_level > _Settings.tilt_deg,
             "upper": about_level < -_Settings.tilt_deg,
         }
-        return {edge: int(np.count_nonzero(tilted)) for edge, tilted in ways.items()}
+        return {edge: int(np.count_nonzero(tilted)) for edge, tilted in tilted_by_edge.items()}
 
     @property
     def has_near(self) -> bool:
@@ -109,8 +109,12 @@ class Coverage:
         return texts
 
     def _views_missing(self) -> list[str]:
-        lacking = _Settings.wanted_views - self.whole_views
-        return [f"{lacking} more view{'s' if lacking > 1 else ''}, tilted and anywhere"] if lacking > 0 else []
+        missing_count = _Settings.wanted_views - self.whole_views
+        return (
+            [f"{missing_count} more view{'s' if missing_count > 1 else ''}, tilted and anywhere"]
+            if missing_count > 0
+            else []
+        )
 
 
 def cell_name(row: int, column: int) -> str:

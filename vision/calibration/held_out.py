@@ -14,7 +14,7 @@ from .bundle import POSE, Bundle, solve, view_residuals
 from .influence import inverse_of
 from .settings import FitSettings as _Settings
 from .view import View
-from .weights import weighed
+from .weights import refit_weighted
 
 
 @dataclass(frozen=True)
@@ -40,29 +40,35 @@ class HeldOut:
         return float(gain.mean()) > 2.0 * float(gain.std(ddof=1)) / np.sqrt(len(gain))
 
 
-def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> HeldOut:
+def held_out(views: Sequence[View], corners_m: FloatArray, full_fit: Bundle) -> HeldOut:
     """Cross-validate by views: hold out a tenth of them in turn and predict them.
 
     Args:
-        whole: the fit of all views, from which each part's fit starts. Its rejected corners do not count here.
+        full_fit: the fit of all views, from which each part's fit starts. Its rejected corners do not count here.
     """
     groups = np.arange(len(views)) % min(_Settings.folds, len(views))
     squares = np.zeros(len(views))
     for group in range(groups.max() + 1):
         kept = np.flatnonzero(groups != group).tolist()
-        weights = [whole.weights[k] for k in kept]
+        weights = [full_fit.weights[k] for k in kept]
         part = solve(
-            [views[k] for k in kept], corners_m, whole.model, whole.vector, whole.poses[kept], weights, whole.prior
+            [views[k] for k in kept],
+            corners_m,
+            full_fit.model,
+            full_fit.vector,
+            full_fit.poses[kept],
+            weights,
+            full_fit.prior,
         )
         for k in np.flatnonzero(groups == group).tolist():
-            own = whole.weights[k]
-            left = view_residuals(views[k], corners_m, whole.model, part.vector, whole.poses[k], own)
+            own = full_fit.weights[k]
+            left = view_residuals(views[k], corners_m, full_fit.model, part.vector, full_fit.poses[k], own)
             squares[k] = np.sum(left[own > 0.0] ** 2)
-    freedom = np.array([each.size - POSE for each in whole.kept])
+    freedom = np.array([each.size - POSE for each in full_fit.kept])
     return HeldOut(squares, freedom)
 
 
-def covariance(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> FloatArray:
+def covariance(views: Sequence[View], corners_m: FloatArray, full_fit: Bundle) -> FloatArray:
     """Return the covariance of the rig's parameters, shape (p, p), without assuming independent corners within a view.
 
     A board that is not flat or moves between the two images, and a lens that no model describes, move the corners of
@@ -70,12 +76,14 @@ def covariance(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> F
     disagree, the weights of all depend on each, so they are recomputed without it.
     """
     count = len(views)
-    moved = np.zeros((count, len(whole.vector)))
+    moved = np.zeros((count, len(full_fit.vector)))
     for k in range(count):
         start = replace(
-            whole, poses=np.delete(whole.poses, k, axis=0), weights=(*whole.weights[:k], *whole.weights[k + 1 :])
+            full_fit,
+            poses=np.delete(full_fit.poses, k, axis=0),
+            weights=(*full_fit.weights[:k], *full_fit.weights[k + 1 :]),
         )
-        moved[k] = weighed([*views[:k], *views[k + 1 :]], corners_m, start).vector
-    inverse = inverse_of(whole.normal)
-    known = inverse @ np.diag(whole.prior) @ inverse * whole.sigma_px**2
+        moved[k] = refit_weighted([*views[:k], *views[k + 1 :]], corners_m, start).vector
+    inverse = inverse_of(full_fit.normal)
+    known = inverse @ np.diag(full_fit.prior) @ inverse * full_fit.sigma_px**2
     return np.cov(moved, rowvar=False, bias=True) * (count - 1) + known

@@ -11,7 +11,7 @@ import cv2
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import ImageArray
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_atomically
 from bodyschema.vision.image_file import read_image
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 
@@ -171,7 +171,7 @@ def write_pair(pair: ImagePair, folder: Path, number: int) -> None:
         file = folder / f"{name}{number:02d}.png"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_whole({file: cv2.imencode(file.suffix, image)[1].tobytes()})
+            write_atomically({file: cv2.imencode(file.suffix, image)[1].tobytes()})
         except OSError as error:
             raise CalibrationError(f"{file} cannot be written: {error.strerror}") from error
 

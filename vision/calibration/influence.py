@@ -10,7 +10,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 
-from .bundle import UNDETERMINED, Bundle, lenses_and_rest, seen_with_slopes
+from .bundle import UNDETERMINED, Bundle, residuals_and_jacobian, split_lenses
 from .view import View
 
 
@@ -20,23 +20,23 @@ class Influence:
 
     residual: FloatArray  # measured minus predicted, shape (corners, 2) [px]
     by_pose: FloatArray  # Jacobian of the prediction by the board's pose, shape (2 corners, 6)
-    free: FloatArray  # share of its variance that remains in each corner's residual, shape (corners,)
+    remaining_share: FloatArray  # share of its variance that remains in each corner's residual, shape (corners,)
 
 
 def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Iterator[Influence]:
     """Yield the influence of each fitted view."""
     rig = inverse_of(bundle.normal)
-    lenses, right_eye = lenses_and_rest(bundle.model, bundle.vector)
+    lenses, right_eye = split_lenses(bundle.model, bundle.vector)
     for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
-        residual, slopes = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
+        residual, slopes = residuals_and_jacobian(view, corners_m, lenses, right_eye, pose)
         J, K = np.split(slopes, [len(rig)], axis=1)
         w = np.repeat(weights, 2)[:, None]
         of_pose = np.linalg.inv(K.T @ (w * K))
         J = J - K @ of_pose @ (K.T @ (w * J))
         # The diagonal of the hat matrix (Huber & Ronchetti 2009, section 7.1).
-        taken = w[:, 0] * (np.sum(J @ rig * J, axis=1) + np.sum(K @ of_pose * K, axis=1))
-        free = 1.0 - taken.reshape(-1, 2).mean(axis=1)
-        yield Influence(residual, K, free)
+        leverage = w[:, 0] * (np.sum(J @ rig * J, axis=1) + np.sum(K @ of_pose * K, axis=1))
+        remaining_share = 1.0 - leverage.reshape(-1, 2).mean(axis=1)
+        yield Influence(residual, K, remaining_share)
 
 
 def inverse_of(normal: FloatArray) -> FloatArray:

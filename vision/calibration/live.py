@@ -12,7 +12,7 @@ import numpy as np
 from bodyschema.interfaces.records import StereoFrame
 from bodyschema.vision.board import Board, BoardDetector
 
-from .gather import Detector, Gathered, Unusable, eyes_of, looked_at
+from .gather import Detector, Gathered, Unusable, eyes_of, find_board
 from .guidance import cell_counts, rough_tilt_deg
 from .image_pairs import ImagePair
 from .settings import ViewSettings as _Settings
@@ -61,7 +61,7 @@ class LiveViews:
             CalibrationError: the two eyes' images are of different sizes.
         """
         pair = ImagePair(f"view {len(self.found.views) + 1}", frame.left, frame.right)
-        view, unusable = looked_at(pair, self._detector)
+        view, unusable = find_board(pair, self._detector)
         self.found.image_size_px, self.found.eyes = pair.size_px, eyes_of(pair)
         outcome = self._outcome(view)
         if outcome is Outcome.TAKEN:

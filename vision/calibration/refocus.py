@@ -10,7 +10,7 @@ from scipy.special import chdtri
 
 from bodyschema.interfaces.records import FloatArray
 
-from .bundle import Bundle, lenses_and_rest, seen_with_slopes
+from .bundle import Bundle, residuals_and_jacobian, split_lenses
 from .settings import FitSettings as _Settings
 from .view import View
 
@@ -22,10 +22,10 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
     too: the ratio of fx and fy, a board that is bent or not rectangular, and one that moved between the two images.
     The shape that the board has in all views alike is removed first.
     """
-    lenses, right_eye = lenses_and_rest(bundle.model, bundle.vector)
+    lenses, right_eye = split_lenses(bundle.model, bundle.vector)
     seen, eyes = list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]](), list[FloatArray]()
     for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
-        residual, slopes = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
+        residual, slopes = residuals_and_jacobian(view, corners_m, lenses, right_eye, pose)
         root, by_pose = np.sqrt(np.repeat(weights, 2))[:, None], slopes[:, -6:]
         focal, aspect = _by_lenses(slopes, [lens.focal_px for lens in lenses])
         others = [aspect]
@@ -35,8 +35,8 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         in_view = focal.any(axis=0)
         eyes.append(np.eye(len(lenses))[in_view])
         # The board's pose is free.
-        off, focal, board, rest = (
-            _without(root * by_pose, root * each)
+        error, focal, board, rest = (
+            _orthogonal(root * by_pose, root * each)
             for each in (
                 residual.reshape(-1, 1),
                 focal[:, in_view],
@@ -44,21 +44,21 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
                 np.column_stack(others),
             )
         )
-        seen.append((off, focal, board, rest))
-    shapes = np.concatenate([_without(focal, np.column_stack([board, off])) for off, focal, board, _ in seen])
+        seen.append((error, focal, board, rest))
+    shapes = np.concatenate([_orthogonal(focal, np.column_stack([board, error])) for error, focal, board, _ in seen])
     shape = np.linalg.lstsq(shapes[:, :-1], shapes[:, -1:])[0]
     by_focal, by_others, pulls = [], [], list[tuple[FloatArray, FloatArray]]()
     squares, freedom = 0.0, 0
-    for (off, focal, board, rest), eye in zip(seen, eyes, strict=True):
-        off = off - board @ shape
-        normal, pull = np.sum(focal**2, axis=0), (focal.T @ off)[:, 0]
+    for (error, focal, board, rest), eye in zip(seen, eyes, strict=True):
+        error = error - board @ shape
+        normal, pull = np.sum(focal**2, axis=0), (focal.T @ error)[:, 0]
         pulls.append((eye.T @ focal.T @ focal @ eye, eye.T @ pull))
         by_focal.extend(pull**2 / normal)
-        off, rest = _without(focal, off), _without(focal, np.column_stack([rest, board]))
+        error, rest = _orthogonal(focal, error), _orthogonal(focal, np.column_stack([rest, board]))
         # A freedom that this view lacks explains nothing.
-        by_others.append((rest.T @ off)[:, 0] ** 2 / np.maximum(np.sum(rest**2, axis=0), np.finfo(np.float64).tiny))
-        squares += float(np.sum(off**2))
-        freedom += len(off) - 6 - len(normal)
+        by_others.append((rest.T @ error)[:, 0] ** 2 / np.maximum(np.sum(rest**2, axis=0), np.finfo(np.float64).tiny))
+        squares += float(np.sum(error**2))
+        freedom += len(error) - 6 - len(normal)
     variance = squares / max(freedom, 1)
     explained = np.mean(by_focal) / max(variance, np.mean(by_others, axis=0).max())
     if explained < max(_Settings.clearly, float(chdtri(len(by_focal), _Settings.false_alarms)) / len(by_focal)):
@@ -117,7 +117,7 @@ def _by_board(view: View, corners_m: FloatArray, by_pose: FloatArray, pose: Floa
     return (shapes[:, None, :] * along[:, :, [2, 2, 2, 0, 1]]).reshape(len(by_pose), -1)
 
 
-def _without(columns: FloatArray, values: FloatArray) -> FloatArray:
+def _orthogonal(columns: FloatArray, values: FloatArray) -> FloatArray:
     """Return `values` orthogonal to `columns`, both with rows first."""
     basis, _ = np.linalg.qr(columns)
     return values - basis @ (basis.T @ values)

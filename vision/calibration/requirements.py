@@ -15,7 +15,7 @@ from .settings import ViewSettings as _Settings
 from .view import image_of
 
 
-def lacking(coverage: Coverage) -> list[str]:
+def unmet_requirements(coverage: Coverage) -> list[str]:
     """Return the requirements that the views do not meet, before a fit."""
     reasons = []
     who = "both eyes saw" if len(coverage.eyes) > 1 else "the camera saw"
@@ -25,32 +25,32 @@ def lacking(coverage: Coverage) -> list[str]:
             f"{_Settings.wanted_views} are good"
         )
     tilted = np.count_nonzero(coverage.largest_tilts_deg > _Settings.tilted_deg)
-    if coverage.whole_views and tilted < _Settings.least_tilted:
+    if coverage.whole_views and tilted < _Settings.min_tilted:
         reasons.append(
             f"the board faces the cameras in all views{f' but {tilted}' if tilted else ''}: focal length and distance "
             "cannot be told apart. Tilt it by 20° to 40°, each way"
         )
     for eye in coverage.eyes:
         covered = coverage.covered(eye)
-        if np.count_nonzero(covered) < _Settings.least_cells:
+        if np.count_nonzero(covered) < _Settings.min_cells:
             empty = ", ".join(cell_name(r, c) for r, c in np.argwhere(~covered).tolist())
             reasons.append(f"the board was hardly ever in these parts of the {image_of(eye, coverage.eyes)}: {empty}")
     return reasons
 
 
-def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None:
+def misplacement(R_right_left: FloatArray, translation_m: FloatArray) -> str | None:
     """Return a message if the eyes are exchanged, upside down or one above the other, otherwise None.
 
     Args:
         R_right_left, translation_m: a point x of the left eye's frame is at R x + t in the right one's.
     """
     about_sight = abs(np.arctan2(R_right_left[1, 0], R_right_left[0, 0]))
-    if about_sight > np.pi - _Settings.most_turned_rad:
+    if about_sight > np.pi - _Settings.max_turned_rad:
         return (
             "one camera is upside down: the images are turned by "
             f"{np.degrees(about_sight):.0f}° against each other. Turn that camera, or its images where it is configured"
         )
-    if about_sight > _Settings.most_turned_rad:
+    if about_sight > _Settings.max_turned_rad:
         return f"one camera lies on its side: the images are turned by {np.degrees(about_sight):.0f}°. Turn it upright"
     right_eye = -R_right_left.T @ translation_m
     if abs(right_eye[0]) < np.max(np.abs(right_eye[1:])):
@@ -64,13 +64,13 @@ def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None
     return None
 
 
-def unsure(rig: Rig) -> list[str]:
+def undetermined(rig: Rig) -> list[str]:
     """Return messages for the parameters that are not determined precisely enough."""
     reasons = []
     width = rig.image_size_px[0]
-    if rig.made.held_out_px > (most_px := _Settings.most_held_out * width):
+    if rig.provenance.held_out_px > (most_px := _Settings.max_held_out * width):
         reasons.append(
-            f"views that were not fitted are off by {rig.made.held_out_px:.2f} px, {most_px:.2f} px is "
+            f"views that were not fitted are off by {rig.provenance.held_out_px:.2f} px, {most_px:.2f} px is "
             "the most. Is the board flat and held still, the right lens model chosen, focus fixed?"
         )
     sigma = dict(zip(rig.names, rig.sigma.tolist(), strict=True))
@@ -78,12 +78,12 @@ def unsure(rig: Rig) -> list[str]:
     for eye in ("left", "right")[: len(rig.serials)]:
         whose = f"{eye} " if len(rig.serials) > 1 else ""
         focal = max(sigma[f"{eye}.f{axis}_px"] / value[f"{eye}.f{axis}_px"] for axis in "xy")
-        if focal > _Settings.most_sigma:
+        if focal > _Settings.max_sigma:
             reasons.append(
                 f"the {whose}focal length is known to {focal:.1%} only. Take views with the board tilted more"
             )
         centre = max(sigma[f"{eye}.c{axis}_px"] for axis in "xy")
-        if centre > _Settings.most_centre_sigma * width:
+        if centre > _Settings.max_centre_sigma * width:
             reasons.append(
                 f"the {whose}principal point is known to {centre:.1f} px only. Take tilted views near corners"
             )
@@ -94,16 +94,16 @@ def unsure(rig: Rig) -> list[str]:
     if not isinstance(rig, StereoRig):
         return reasons
     share = rig.baseline_sigma_m / rig.baseline_m
-    if share > _Settings.most_sigma:
+    if share > _Settings.max_sigma:
         reasons.append(
             f"the baseline is known to {share:.1%} only. Take more views that both eyes see, near and tilted"
         )
     return reasons
 
 
-def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
+def baseline_contradiction(rig: StereoRig, baseline_m: float) -> str | None:
     """Return a message if the baseline measured by hand contradicts the calibrated one, otherwise None."""
-    allowed = np.hypot(3.0 * rig.baseline_sigma_m, _Settings.most_hand_error_m)
+    allowed = np.hypot(3.0 * rig.baseline_sigma_m, _Settings.max_hand_error_m)
     ratio = baseline_m / rig.baseline_m
     if abs(baseline_m - rig.baseline_m) <= allowed:
         return None
@@ -114,6 +114,6 @@ def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
     )
 
 
-def together(reasons: Sequence[str]) -> str:
+def join_reasons(reasons: Sequence[str]) -> str:
     """Join the reasons into one message."""
     return reasons[0] if len(reasons) == 1 else "".join(f"\n- {reason}" for reason in reasons)

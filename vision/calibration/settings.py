@@ -9,12 +9,12 @@ class FitSettings:
     """Settings of the fit.
 
     Sensitivity, each at 0.3 and 3 times over six sets of views of the tests: `farthest` at 0.3 times moves a number by
-    2.2 sigma, the other weights by less than 0.15 sigma; `most_left_out` at 0.3 times loses a set. `fisheye_focals` and
+    2.2 sigma, the other weights by less than 0.15 sigma; `max_left_out` at 0.3 times loses a set. `fisheye_focals` and
     `folds` were not measured; the others change nothing there.
     """
 
     # A view farther than this from the median, in spreads of all views, is left out; more than this share are too many.
-    outlier_spreads, most_left_out = 8.0, 0.35
+    outlier_spreads, max_left_out = 8.0, 0.35
     # 1-sigma of the last term of the distortion, at the image's corner, where it would fold the image over: a lens of a
     # webcam has 0.01.
     steepest_term = 0.02
@@ -34,22 +34,22 @@ class FitSettings:
 class ViewSettings:
     """Settings of what views have to show, and of the advice on the next one.
 
-    They refuse a calibration or ask for more views, and change no result. Of six sets of the tests, `least_cells` and
-    `least_tilted` at 3 times refuse four or five more, `tilted_deg` two; at 0.3 times none changes more than one.
+    They refuse a calibration or ask for more views, and change no result. Of six sets of the tests, `min_cells` and
+    `min_tilted` at 3 times refuse four or five more, `tilted_deg` two; at 0.3 times none changes more than one.
     `least_views`, `wanted_views`, `corners_a_cell`, `tilted_each_way`, `still_px`, `new_share` and `new_tilt_deg` were
     not measured.
     """
 
     least_views, wanted_views = 8, 20  # seen by all eyes: fewer are refused, more are not asked for
-    least_cells, corners_a_cell = 6, 8  # of nine cells, in which so many corners were seen
-    tilted_deg, least_tilted = 10.0, 3  # so many views with a tilt that tells focal length from distance
+    min_cells, corners_a_cell = 6, 8  # of nine cells, in which so many corners were seen
+    tilted_deg, min_tilted = 10.0, 3  # so many views with a tilt that tells focal length from distance
     # Sigmas are those of whole views, two to six times those of independent corners: fifteen good pairs at 640×480
     # leave 0.9 %, 0.5 % and 2.2 %. A principal point that is off turns the frame, and changes little else.
-    most_sigma = 0.01  # of the focal length, and of the baseline
-    most_centre_sigma = 0.03  # of the image's width
-    most_held_out = 0.0015  # of the image's width
-    most_turned_rad = np.radians(45.0)  # more, and a camera lies on its side
-    most_hand_error_m = 0.0015  # of a baseline measured with a ruler
+    max_sigma = 0.01  # of the focal length, and of the baseline
+    max_centre_sigma = 0.03  # of the image's width
+    max_held_out = 0.0015  # of the image's width
+    max_turned_rad = np.radians(45.0)  # more, and a camera lies on its side
+    max_hand_error_m = 0.0015  # of a baseline measured with a ruler
     usual_focal = 0.9  # share of the image's width: focal length of a typical webcam, used before calibration
     tilt_deg, tilted_each_way = 15.0, 2  # of the views that are advised
     near, far = 0.55, 0.40  # extent of the board as a share of the image

@@ -35,7 +35,7 @@ class _Spread:
     width: FloatArray
     image: NDArray[np.int64]
 
-    def usual(self, share: FloatArray, kept: NDArray[np.bool_], *, robust: bool) -> FloatArray:
+    def typical(self, share: FloatArray, kept: NDArray[np.bool_], *, robust: bool) -> FloatArray:
         """Return the variance of corners by the width of their squares, relative to their image's level."""
         order = np.flatnonzero(kept)[np.argsort(self.width[kept], kind="stable")]
         groups = np.array_split(order, max(len(order) // _Settings.group, 1))
@@ -45,19 +45,19 @@ class _Spread:
         middle = [float(np.median(np.log(self.width[each]))) for each in groups]
         return np.exp(np.interp(np.log(self.width), middle, np.log(np.maximum(falling, 1e-12))))
 
-    def shares(self, usual: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
+    def image_factors(self, typical: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
         """Return the variance of each corner's image relative to the usual one."""
-        among = kept.astype(np.float64)
-        count, total = np.bincount(self.image, among), np.bincount(self.image, among * self.own / usual)
+        is_kept = kept.astype(np.float64)
+        count, total = np.bincount(self.image, is_kept), np.bincount(self.image, is_kept * self.own / typical)
         return ((total + _Settings.shared) / (count + _Settings.shared))[self.image]
 
-    def fitting(self, usual: FloatArray) -> NDArray[np.bool_]:
+    def inliers(self, typical: FloatArray) -> NDArray[np.bool_]:
         """Return the mask of the corners that are not outliers."""
         fits = np.ones(len(self.own), dtype=bool)
         for number in range(int(self.image.max()) + 1):
-            mine = np.flatnonzero(self.image == number)
-            off = self.own[mine] / usual[mine]
-            fits[mine] = off <= 0.5 * _Settings.farthest**2 * max(float(np.median(off)) / _MEDIAN, 1.0)
+            rows = np.flatnonzero(self.image == number)
+            relative = self.own[rows] / typical[rows]
+            fits[rows] = relative <= 0.5 * _Settings.farthest**2 * max(float(np.median(relative)) / _MEDIAN, 1.0)
         return fits
 
 
@@ -68,15 +68,15 @@ def corner_weights(views: Sequence[View], corners_m: FloatArray, bundle: Bundle)
     """
     spread = _spread(views, corners_m, bundle)
     everything = np.ones(len(spread.own), dtype=bool)
-    usual = spread.usual(np.ones(len(spread.own)), everything, robust=True)
-    kept = spread.fitting(usual)
-    usual = spread.usual(spread.shares(usual, kept), kept, robust=False)
-    weights = np.where(kept, 1.0 / (usual * spread.shares(usual, kept)), 0.0)
+    typical = spread.typical(np.ones(len(spread.own)), everything, robust=True)
+    kept = spread.inliers(typical)
+    typical = spread.typical(spread.image_factors(typical, kept), kept, robust=False)
+    weights = np.where(kept, 1.0 / (typical * spread.image_factors(typical, kept)), 0.0)
     weights /= weights.mean()
     return tuple(np.split(weights, np.cumsum([view.corner_count for view in views])[:-1]))
 
 
-def weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
+def refit_weighted(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
     """Refit with weights that follow the accuracy of each image's corners."""
     for _ in range(_Settings.reweighted):
         weights = corner_weights(views, corners_m, bundle)
@@ -87,7 +87,7 @@ def weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bun
 def _spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> _Spread:
     own, width, image = [], [], []
     for k, (view, pose, each) in enumerate(zip(views, bundle.poses, influences(views, corners_m, bundle), strict=True)):
-        own.append(0.5 * np.sum(each.residual**2, axis=1) / each.free)
+        own.append(0.5 * np.sum(each.residual**2, axis=1) / each.remaining_share)
         # Pixels per step along the board's axes, and from them the width of a square in its narrower direction.
         steps = each.by_pose[:, 3:].reshape(-1, 2, 3) @ Rotation.from_rotvec(pose[:3]).as_matrix()[:, :2]
         width.append(1.0 / np.linalg.norm(np.linalg.inv(steps), axis=2).max(axis=1))

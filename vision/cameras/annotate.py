@@ -56,7 +56,7 @@ class Annotator:
                 found.append(Sight(_pair(outcome.centre_px), outcome.radius_px, None))
         return found
 
-    def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
+    def annotated(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
         """Return all images side by side (height, eyes width, 3), with annotations."""
         eyes = [np.ascontiguousarray(image).copy() for image in frame.images]
         sights = [self.sights(image) for image in frame.images]

@@ -60,7 +60,7 @@ class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     right: str
 
     @property
-    def longest_apart_s(self) -> float:
+    def max_gap_s(self) -> float:
         """Longest time between the two images of a pair: free-running cameras are up to half a frame apart."""
         return 0.6 / self.fps
 

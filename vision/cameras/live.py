@@ -37,9 +37,9 @@ class CameraFigures:
     frames: int  # number received since it was opened
     fps: float | None  # measured frame rate; None while too few frames have arrived
     stamps: str | None  # "kernel" or "arrival"; None before any
-    # damaged, doubted: numbers of images with a missing part, and with an implausible time
+    # damaged, rejected: numbers of images with a missing part, and with an implausible time
     damaged: int
-    doubted: int
+    rejected: int
 
 
 class LiveEyes:
@@ -59,7 +59,7 @@ class LiveEyes:
             self._capture(eye, CameraDevice(name, device, layout, clock, open_capture))
             for eye, (name, device) in enumerate(config.devices.items())
         ]
-        self._pairing = Pairing(layout.longest_apart_s if isinstance(layout, TwoConfig) else 0.0)
+        self._pairing = Pairing(layout.max_gap_s if isinstance(layout, TwoConfig) else 0.0)
         self._waiting: StereoFrame | None = None
         self._last_t = -math.inf
         self._opened = ExitStack()
@@ -190,15 +190,15 @@ class LiveEyes:
                 )
             if device.damaged > capture.look.frames:
                 yield f"the {device.name} sends more damaged images than whole ones: try another cable or port"
-        if self._pairing.too_far > _Settings.unpaired_images and self._pairing.apart_s is not None:
+        if self._pairing.too_far > _Settings.unpaired_images and self._pairing.gap_s is not None:
             yield (
                 f"{self._pairing.too_far} times the two eyes' images were too far apart, last "
-                f"{1e3 * self._pairing.apart_s:.0f} ms: do both cameras have the same fps and exposure_s?"
+                f"{1e3 * self._pairing.gap_s:.0f} ms: do both cameras have the same fps and exposure_s?"
             )
 
 
 def _figures(capture: Capture) -> CameraFigures:
     device, look = capture.device, capture.look
     return CameraFigures(
-        device.name, look.frames, look.fps, device.stamps.source, device.damaged, device.stamps.doubted
+        device.name, look.frames, look.fps, device.stamps.source, device.damaged, device.stamps.rejected
     )

@@ -8,17 +8,17 @@ from pathlib import Path
 from bodyschema.interfaces.protocols import Clock
 
 from .config import CamerasConfig, ImagesConfig, OneConfig, RealsenseConfig, SideBySideConfig, TwoConfig, VideosConfig
-from .film import Film, Roll
-from .image_roll import ImageRoll
+from .image_reader import ImageReader
 from .live import LiveEyes
 from .realsense import RealsenseCamera
+from .recorded_eyes import FrameReader, RecordedEyes
 from .v4l2.device import OpenCapture, open_v4l2
-from .videos import VideoRoll
+from .videos import VideoReader
 
 
 def eyes_of(
     config: CamerasConfig, folder: Path, clock: Clock, open_capture: OpenCapture = open_v4l2
-) -> LiveEyes | RealsenseCamera | Film:
+) -> LiveEyes | RealsenseCamera | RecordedEyes:
     """Create the configured cameras or files as `StereoEyes`, not opened yet.
 
     Args:
@@ -31,10 +31,12 @@ def eyes_of(
         case RealsenseConfig() as realsense:
             return RealsenseCamera(config, realsense, clock)
         case ImagesConfig() as images:
-            return _film(config, lambda: ImageRoll(images, folder), clock, images.speed)
+            return _recorded_eyes(config, lambda: ImageReader(images, folder), clock, images.speed)
         case VideosConfig() as videos:
-            return _film(config, lambda: VideoRoll(videos, folder), clock, videos.speed)
+            return _recorded_eyes(config, lambda: VideoReader(videos, folder), clock, videos.speed)
 
 
-def _film(config: CamerasConfig, roll: Callable[[], Roll], clock: Clock, speed: float) -> Film:
-    return Film(roll, clock, speed=speed, latency_s=config.latency_s, sigma_s=config.sigma_s)
+def _recorded_eyes(
+    config: CamerasConfig, reader: Callable[[], FrameReader], clock: Clock, speed: float
+) -> RecordedEyes:
+    return RecordedEyes(reader, clock, speed=speed, latency_s=config.latency_s, sigma_s=config.sigma_s)

@@ -27,16 +27,16 @@ class Pairing:
 
     Attributes:
         too_far: number of images without a partner near enough in time.
-        apart_s: time between the last two candidates [s], near enough or not; None before the first.
+        gap_s: time between the last two candidates [s], near enough or not; None before the first.
     """
 
-    def __init__(self, longest_apart_s: float) -> None:
-        self._longest_apart_s = longest_apart_s
+    def __init__(self, max_gap_s: float) -> None:
+        self._max_gap_s = max_gap_s
         self._shots: tuple[deque[Shot], deque[Shot]] = (deque(maxlen=KEPT), deque(maxlen=KEPT))
-        self._given = [-math.inf, -math.inf]
-        self._tried = -math.inf
+        self._returned_t = [-math.inf, -math.inf]
+        self._last_lagging_t = -math.inf
         self.too_far = 0
-        self.apart_s: float | None = None
+        self.gap_s: float | None = None
 
     def put(self, eye: int, shot: Shot) -> None:
         """Add the newest image of the left (0) or the right (1) eye."""
@@ -48,16 +48,16 @@ class Pairing:
             return None
         lagging = 0 if self._shots[0][-1].t <= self._shots[1][-1].t else 1
         shot = self._shots[lagging][-1]
-        if shot.t <= max(self._tried, self._given[lagging]):
+        if shot.t <= max(self._last_lagging_t, self._returned_t[lagging]):
             return None
-        left_over = [candidate for candidate in self._shots[1 - lagging] if candidate.t > self._given[1 - lagging]]
-        if not left_over:
+        unused = [candidate for candidate in self._shots[1 - lagging] if candidate.t > self._returned_t[1 - lagging]]
+        if not unused:
             return None
-        other = min(left_over, key=lambda candidate: abs(candidate.t - shot.t))
-        self._tried, self.apart_s = shot.t, abs(other.t - shot.t)
-        if self.apart_s > self._longest_apart_s:
+        other = min(unused, key=lambda candidate: abs(candidate.t - shot.t))
+        self._last_lagging_t, self.gap_s = shot.t, abs(other.t - shot.t)
+        if self.gap_s > self._max_gap_s:
             self.too_far += 1
             return None
         left, right = (shot, other) if lagging == 0 else (other, shot)
-        self._given = [left.t, right.t]
+        self._returned_t = [left.t, right.t]
         return left, right

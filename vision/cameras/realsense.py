@@ -55,10 +55,10 @@ def connected_device(serial: str | None) -> Any:
         )
     if not devices or (serial is not None and serial not in devices):
         there = f"connected are {', '.join(devices)}" if devices else "none is connected"
-        wanted = "RealSense camera" if serial is None else f"RealSense camera {serial}"
+        requested = "RealSense camera" if serial is None else f"RealSense camera {serial}"
         raise SourceLost(
-            f"the {wanted} is not there; {there}. Plug it into a USB 3 port, and see what `lsusb -d 8086:` lists",
-            brief=f"the {wanted} is not there",
+            f"the {requested} is not there; {there}. Plug it into a USB 3 port, and see what `lsusb -d 8086:` lists",
+            brief=f"the {requested} is not there",
         )
     return next(iter(devices.values())) if serial is None else devices[serial]
 
@@ -217,8 +217,8 @@ class RealsenseCamera:
                 if (video.width(), video.height(), profile.fps()) == (width, height, round(self._settings.fps)):
                     found[name] = profile
             if {"left", "right"} <= found.keys():
-                wanted = ("left", "right", *(["depth"] if self._settings.depth_check and "depth" in found else []))
-                return sensor, {name: found[name] for name in wanted}
+                requested = ("left", "right", *(["depth"] if self._settings.depth_check and "depth" in found else []))
+                return sensor, {name: found[name] for name in requested}
         raise SourceError(
             f"the RealSense has no pair of infra-red images of {width}x{height} pixels at {self._settings.fps:g} a "
             f"second. Choose among {', '.join(sorted(offered)) or 'none'} in [vision.cameras.realsense]"
@@ -242,13 +242,13 @@ class RealsenseCamera:
 
     def _apply(self, rs: Any, sensor: Any) -> None:
         """Write the settings. The projector is off by default: its dots would be taken for texture of the marker."""
-        wanted: dict[Any, float] = {rs.option.emitter_enabled: float(self._settings.emitter)}
-        wanted[rs.option.global_time_enabled] = 1.0
+        requested: dict[Any, float] = {rs.option.emitter_enabled: float(self._settings.emitter)}
+        requested[rs.option.global_time_enabled] = 1.0
         if self._settings.exposure_s is not None:
-            wanted |= {rs.option.enable_auto_exposure: 0.0, rs.option.exposure: 1e6 * self._settings.exposure_s}
+            requested |= {rs.option.enable_auto_exposure: 0.0, rs.option.exposure: 1e6 * self._settings.exposure_s}
         if self._settings.gain is not None:
-            wanted[rs.option.gain] = self._settings.gain
-        for option, value in wanted.items():
+            requested[rs.option.gain] = self._settings.gain
+        for option, value in requested.items():
             if sensor.supports(option) and not sensor.is_option_read_only(option):
                 sensor.set_option(option, value)
 

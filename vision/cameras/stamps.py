@@ -28,7 +28,7 @@ class Stamps:
         self._seen: list[tuple[float, float]] = []
         self._last = -math.inf
         self.source: str | None = None
-        self.doubted = 0
+        self.rejected = 0
 
     @property
     def sigma_s(self) -> float:
@@ -46,15 +46,15 @@ class Stamps:
             self._seen.append((kernel_s, arrival_s))
             if len(self._seen) < _Settings.trial_frames:
                 return None
-            self.source = "kernel" if self._are_believable() else "arrival"
+            self.source = "kernel" if self._are_plausible() else "arrival"
         t = kernel_s if self.source == "kernel" else arrival_s
         if t <= self._last or (self.source == "kernel" and not _near(kernel_s, arrival_s)):
-            self.doubted += 1
+            self.rejected += 1
             return None
         self._last = t
         return t
 
-    def _are_believable(self) -> bool:
+    def _are_plausible(self) -> bool:
         stamps = [kernel for kernel, _ in self._seen]
         increasing = all(later > earlier for earlier, later in pairwise(stamps))
         return increasing and all(_near(kernel, arrival) for kernel, arrival in self._seen)

@@ -14,13 +14,13 @@ from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray, ImageArray, frozen_array
 
 from .config import VideosConfig
-from .film import read_times
+from .recorded_eyes import read_times
 
 _AV1 = int.from_bytes(b"AV01", "little")
 _CONVERT = "`ffmpeg -i OLD.mp4 -c:v libx264 -crf 18 NEW.mp4`"
 
 
-class _Film(Protocol):
+class _VideoDecoder(Protocol):
     """The subset of cv2.VideoCapture in use."""
 
     def grab(self) -> bool: ...
@@ -32,7 +32,7 @@ class _Film(Protocol):
     def release(self) -> None: ...
 
 
-class _Av1Film:
+class _Av1Decoder:
     """An AV1 film decoded by PyAV, since OpenCV's wheels cannot decode it."""
 
     def __init__(self, file: Path) -> None:
@@ -65,15 +65,15 @@ class _Av1Film:
         self._container.close()
 
 
-def _film(file: Path) -> _Film:
+def _video_capture(file: Path) -> _VideoDecoder:
     capture = cv2.VideoCapture(str(file))
     if round(capture.get(cv2.CAP_PROP_FOURCC)) != _AV1:
         return capture
     capture.release()
-    return _Av1Film(file)
+    return _Av1Decoder(file)
 
 
-class VideoRoll:
+class VideoReader:
     """Two films, the film of a single camera, or a film whose frames contain both eyes' images.
 
     Attributes:
@@ -91,7 +91,7 @@ class VideoRoll:
         self._files = [folder / name for name in ((both,) if both else (config.left, config.right)) if name]
         eyes = [str(name) for name in (config.left, config.right) if name is not None]
         self.serials = (f"{both}/left", f"{both}/right") if both else tuple(eyes)
-        self._captures: list[_Film] = []
+        self._captures: list[_VideoDecoder] = []
         sizes, counts, rates = zip(*(_measured(file) for file in self._files), strict=True)
         if len(set(sizes)) > 1:
             said = " and ".join(f"{width}x{height}" for width, height in sizes)
@@ -119,7 +119,7 @@ class VideoRoll:
 
     def open(self, place: int) -> None:
         """Prepare to read the pair at `place`."""
-        self._captures = [_film(file) for file in self._files]
+        self._captures = [_video_capture(file) for file in self._files]
         for _ in range(place):  # seeking is not exact in every film
             for capture in self._captures:
                 capture.grab()
@@ -148,7 +148,7 @@ def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
     """Return the size of the frames, the number that can be read, and their rate [1/s]."""
     if not file.is_file():
         raise ConfigError("there is no such film", file=file, remedy="Files are named relative to robot.toml")
-    capture = _film(file)
+    capture = _video_capture(file)
     try:
         count = 0
         while capture.grab():  # the file's own metadata is often wrong

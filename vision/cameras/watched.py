@@ -52,7 +52,7 @@ class WatchedCamera:
             self.fixes += 1
         else:
             self.reasons[seen.reason] = self.reasons.get(seen.reason, 0) + 1
-        return self._annotator.drawn(frame, seen)
+        return self._annotator.annotated(frame, seen)
 
     @property
     def said(self) -> str:

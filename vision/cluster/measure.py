@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.least_squares import damped_step, minimised
-from bodyschema.vision.pose import fitted_motion, projection_slopes, turned, whitening
+from bodyschema.vision.pose import fitted_motion, projection_jacobian, turn_jacobian, whitening
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 from bodyschema.vision.tags.body import TAG_CORNERS
 from bodyschema.vision.tags.config import PlacedTag
@@ -29,7 +29,7 @@ class _Settings:
     most_off_sigmas = 6.0
     most_usual = 5.0  # ... in units of what is usual, which calibrated cameras bring to so much at most
     # Largest share of all views, and of the views of one tag, with outliers; a single one is always allowed.
-    most_left_out = 0.34
+    max_left_out = 0.34
     least_views = 3  # for a rigid cluster
 
 
@@ -98,7 +98,7 @@ def measure_cluster(
             f"{_Settings.least_views} are needed, 20 are good. Turn the cluster slowly, all its edges towards the "
             "cameras"
         )
-    every, left_out = usable, list[tuple[str, int]]()
+    all_usable, left_out = usable, list[tuple[str, int]]()
     while True:
         problem = _Problem(usable, calibration, side_m, other_sides_m or {})
         worst = problem.worst()
@@ -107,16 +107,16 @@ def measure_cluster(
             return problem.result(left_out, [view.name for view in views if view.name not in used])
         left_out.append(worst)
         usable = _usable([_without(view, worst) for view in usable])
-        if len(usable) < _Settings.least_views or _is_odd(left_out, every):
-            odd = _odd_one(every, calibration, side_m, other_sides_m)
-            raise CalibrationError(_not_rigid(left_out, odd))
+        if len(usable) < _Settings.least_views or _has_too_many_outliers(left_out, all_usable):
+            bad_tag = _bad_tag(all_usable, calibration, side_m, other_sides_m)
+            raise CalibrationError(_not_rigid_message(left_out, bad_tag))
 
 
 def _usable(views: Sequence[ClusterView]) -> list[ClusterView]:
     return [view for view in views if len(view.ids) >= 2 and view.left.keys() & view.right.keys()]
 
 
-def _odd_one(
+def _bad_tag(
     views: Sequence[ClusterView],
     calibration: StereoCalibration,
     side_m: float,
@@ -131,24 +131,24 @@ def _odd_one(
         with suppress(CalibrationError):
             problem = _Problem(rest, calibration, side_m, other_sides_m or {})
             if problem.worst() is None:
-                fits[id] = problem.misfit
+                fits[id] = problem.residual_rms
     best = min(fits, key=lambda id: fits[id], default=None)
     return best if best is not None and fits[best] < _Settings.most_usual else None
 
 
-def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -> bool:
+def _has_too_many_outliers(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -> bool:
     """Return True if too many views, or too many views of one tag, have outliers for this to be chance."""
     shown, times = Counter(id for view in views for id in view.ids), Counter(id for _, id in left_out)
-    if len({name for name, _ in left_out}) > max(1.0, _Settings.most_left_out * len(views)):
+    if len({name for name, _ in left_out}) > max(1.0, _Settings.max_left_out * len(views)):
         return True
-    return any(count > max(1.0, _Settings.most_left_out * shown[id]) for id, count in times.items())
+    return any(count > max(1.0, _Settings.max_left_out * shown[id]) for id, count in times.items())
 
 
-def _not_rigid(left_out: Sequence[tuple[str, int]], odd: int | None) -> str:
+def _not_rigid_message(left_out: Sequence[tuple[str, int]], tag: int | None) -> str:
     """Return the error message for tags whose positions differ from view to view."""
-    if odd is not None:
+    if tag is not None:
         return (
-            f"the tags do not fit one rigid body, and without tag {odd} all others do. Is its number there twice, does "
+            f"the tags do not fit one rigid body, and without tag {tag} all others do. Is its number there twice, does "
             "it hang loose, and is its side right (--side-mm, --other-sides-mm)? Else leave it out: --ids"
         )
     first = ", ".join(f"tag {id} in {name}" for name, id in left_out[:4])
@@ -186,14 +186,14 @@ class _Linearised:
     bodies: Sequence[Motion]
     residuals: FloatArray
     J: FloatArray
-    grown: FloatArray
+    by_size: FloatArray
 
     @property
     def squares(self) -> float:
         return float(self.residuals @ self.residuals)
 
     @property
-    def misfit(self) -> float:
+    def residual_rms(self) -> float:
         """RMS of the residuals, in units of the corners' own sigmas."""
         return float(np.sqrt(self.squares / max(len(self.residuals) - self.J.shape[1], 1)))
 
@@ -218,11 +218,11 @@ class _Problem:
             if tags
         ]
         located = [self._located(view) for view in views]
-        tags = self._first_tags(
+        tags = self._initial_tag_poses(
             [{id: fitted_motion(self._corners[id], seen) for id, seen in each.items()} for each in located]
         )
         self._found = minimised(
-            self._linearised(tags, [self._first_body(tags, each) for each in located]), self._stepped
+            self._linearised(tags, [self._initial_body_pose(tags, each) for each in located]), self._stepped
         )
 
     def _block(self, view: int, tags: Mapping[int, TagImage], x: float) -> _Block:
@@ -244,13 +244,13 @@ class _Problem:
                 found[id] = np.array(whole)
         return found
 
-    def _first_tags(self, alone: Sequence[Mapping[int, Motion]]) -> dict[int, Motion]:
+    def _initial_tag_poses(self, tag_poses: Sequence[Mapping[int, Motion]]) -> dict[int, Motion]:
         """Return initial tag poses in the first tag's frame, from tag to tag through views that show both."""
         known: dict[int, Motion] = {self.ids[0]: (np.eye(3), np.zeros(3))}
         while len(known) < len(self.ids):
             # The tag that most views show together with one of known pose.
             counts = {
-                (a, b): sum(a in poses and b in poses for poses in alone)
+                (a, b): sum(a in poses and b in poses for poses in tag_poses)
                 for a in known
                 for b in self.ids
                 if b not in known
@@ -262,11 +262,11 @@ class _Problem:
                     f"no pair of images shows tags {lost} to both eyes together with tags "
                     f"{', '.join(map(str, sorted(known)))}. Take images across those edges"
                 )
-            between = [_after(_inverse(poses[a]), poses[b]) for poses in alone if a in poses and b in poses]
-            known[b] = _after(known[a], _middle(between))
+            between = [_compose(_inverse(poses[a]), poses[b]) for poses in tag_poses if a in poses and b in poses]
+            known[b] = _compose(known[a], _median_motion(between))
         return known
 
-    def _first_body(self, tags: Mapping[int, Motion], located: Mapping[int, FloatArray]) -> Motion:
+    def _initial_body_pose(self, tags: Mapping[int, Motion], located: Mapping[int, FloatArray]) -> Motion:
         if not located:
             raise CalibrationError("a view in which no tag's corners can be located by both eyes")
         body = [self._corners[id] @ tags[id][0].T + tags[id][1] for id in located]
@@ -284,15 +284,15 @@ class _Problem:
             return Rotation.from_rotvec(by[:3]).as_matrix() @ motion[0], motion[1] + by[3:]
 
         step = damped_step(now.J, now.residuals, damping)
-        at = self._columns
-        tags = {id: moved(m, step[at[id] : at[id] + 6]) if id in at else m for id, m in now.tags.items()}
-        first = 6 * len(at)
+        columns = self._columns
+        tags = {id: moved(m, step[columns[id] : columns[id] + 6]) if id in columns else m for id, m in now.tags.items()}
+        first = 6 * len(columns)
         return self._linearised(
             tags, [moved(m, step[first + 6 * k : first + 6 * k + 6]) for k, m in enumerate(now.bodies)]
         )
 
     def _linearised(self, tags: Mapping[int, Motion], bodies: Sequence[Motion]) -> _Linearised:
-        at, first = self._columns, 6 * (len(self.ids) - 1)
+        columns, first = self._columns, 6 * (len(self.ids) - 1)
         width = first + 6 * len(self._views)
         residuals: list[FloatArray] = []
         slopes: list[FloatArray] = []
@@ -301,41 +301,41 @@ class _Problem:
             turn, x = bodies[block.view]
             J = np.zeros((len(block.pixels), 2, width))
             seen = np.zeros_like(block.pixels)
-            grown = np.zeros((len(block.pixels), 2))
+            by_size = np.zeros((len(block.pixels), 2))
             for k, id in enumerate(block.ids):
                 rows = slice(4 * k, 4 * k + 4)
                 on_tag = self._corners[id] @ tags[id][0].T
                 arms = (on_tag + tags[id][1]) @ turn.T
                 points = arms + x - block.eye
-                slope = projection_slopes(self._calibration.focal_px, points)
+                slope = projection_jacobian(self._calibration.focal_px, points)
                 seen[rows] = self._calibration.focal_px * points[:, :2] / points[:, 2:]
                 body = first + 6 * block.view
-                J[rows, :, body : body + 3], J[rows, :, body + 3 : body + 6] = slope @ turned(arms), slope
-                if id in at:
-                    J[rows, :, at[id] : at[id] + 3] = slope @ turn @ turned(on_tag)
-                    J[rows, :, at[id] + 3 : at[id] + 6] = slope @ turn
-                grown[rows] = (slope @ (on_tag @ turn.T)[..., None])[..., 0]
-            off = block.pixels - seen - np.array(self._calibration.principal_point_px)
-            residuals.append(block.root @ off.ravel())
+                J[rows, :, body : body + 3], J[rows, :, body + 3 : body + 6] = slope @ turn_jacobian(arms), slope
+                if id in columns:
+                    J[rows, :, columns[id] : columns[id] + 3] = slope @ turn @ turn_jacobian(on_tag)
+                    J[rows, :, columns[id] + 3 : columns[id] + 6] = slope @ turn
+                by_size[rows] = (slope @ (on_tag @ turn.T)[..., None])[..., 0]
+            residual = block.pixels - seen - np.array(self._calibration.principal_point_px)
+            residuals.append(block.root @ residual.ravel())
             slopes.append(block.root @ J.reshape(-1, width))
-            growths.append(block.root @ grown.ravel())
+            growths.append(block.root @ by_size.ravel())
         together = (np.concatenate(each) for each in (residuals, slopes, growths))
         return _Linearised(tags, bodies, *together)
 
     # --- what comes out
 
     @property
-    def misfit(self) -> float:
+    def residual_rms(self) -> float:
         """RMS of the residuals, in units of the corners' own sigmas."""
-        return self._found.misfit
+        return self._found.residual_rms
 
     def worst(self) -> tuple[str, int] | None:
         """Return the view's name and the tag's number of the worst outlier, or None.
 
         Squares that are all larger or smaller than stated are not outliers: their common size is free here.
         """
-        residuals, J, grown = self._found.residuals, self._found.J, self._found.grown
-        full = np.column_stack([J, grown])
+        residuals, J, by_size = self._found.residuals, self._found.J, self._found.by_size
+        full = np.column_stack([J, by_size])
         residuals = residuals - full @ np.linalg.solve(full.T @ full, full.T @ residuals)
         squares: dict[tuple[str, int], list[FloatArray]] = {}
         place = 0
@@ -343,31 +343,31 @@ class _Problem:
             for id in block.ids:
                 squares.setdefault((self._views[block.view].name, id), []).append(residuals[place : place + 8] ** 2)
                 place += 8
-        off = {key: float(np.sqrt(np.mean(np.concatenate(each)))) for key, each in squares.items()}
-        key = max(off, key=lambda each: off[each])
-        usual = float(np.median(list(off.values())))
-        return key if off[key] > _Settings.most_off_sigmas * min(max(usual, 1.0), _Settings.most_usual) else None
+        rms = {key: float(np.sqrt(np.mean(np.concatenate(each)))) for key, each in squares.items()}
+        key = max(rms, key=lambda each: rms[each])
+        usual = float(np.median(list(rms.values())))
+        return key if rms[key] > _Settings.most_off_sigmas * min(max(usual, 1.0), _Settings.most_usual) else None
 
     def result(self, left_out: Sequence[tuple[str, int]], unused: Sequence[str]) -> MeasuredCluster:
         """Return the solution with its uncertainty, scaled up if the residuals exceed the assumed noise."""
-        residuals, J, grown = self._found.residuals, self._found.J, self._found.grown
-        misfit = self.misfit**2
-        cov = np.linalg.inv(J.T @ J) * max(misfit, 1.0)
-        full = np.column_stack([J, grown])
+        residuals, J, by_size = self._found.residuals, self._found.J, self._found.by_size
+        residual_rms = self.residual_rms**2
+        cov = np.linalg.inv(J.T @ J) * max(residual_rms, 1.0)
+        full = np.column_stack([J, by_size])
         inverse = np.linalg.inv(full.T @ full)
-        at, tags = self._columns, []
+        columns, tags = self._columns, []
         for id in self.ids:
             rotation, xyz = self._found.tags[id]
-            sigma = np.sqrt(np.diag(cov)[at[id] : at[id] + 6]) if id in at else np.zeros(6)
+            sigma = np.sqrt(np.diag(cov)[columns[id] : columns[id] + 6]) if id in columns else np.zeros(6)
             place = float(xyz[0]), float(xyz[1]), float(xyz[2])
             placed = PlacedTag(id=id, xyz=place, rpy=rpy_of(rotation), side_m=self._other_sides_m.get(id))
             tags.append(MeasuredTag(placed, sigma[3:], sigma[:3], sum(id in view.ids for view in self._views)))
-        size = float((inverse @ full.T @ residuals)[-1]), float(np.sqrt(inverse[-1, -1] * max(misfit, 1.0)))
+        size = float((inverse @ full.T @ residuals)[-1]), float(np.sqrt(inverse[-1, -1] * max(residual_rms, 1.0)))
         views, rest = len(self._views), (tuple(left_out), tuple(unused))
-        return MeasuredCluster(tuple(tags), views, float(np.sqrt(misfit)), *rest, *size)
+        return MeasuredCluster(tuple(tags), views, float(np.sqrt(residual_rms)), *rest, *size)
 
 
-def _after(outer: Motion, inner: Motion) -> Motion:
+def _compose(outer: Motion, inner: Motion) -> Motion:
     return outer[0] @ inner[0], outer[0] @ inner[1] + outer[1]
 
 
@@ -375,8 +375,8 @@ def _inverse(motion: Motion) -> Motion:
     return motion[0].T, -motion[0].T @ motion[1]
 
 
-def _middle(motions: Sequence[Motion]) -> Motion:
+def _median_motion(motions: Sequence[Motion]) -> Motion:
     """Return the motion whose rotation has the smallest median angle to the others."""
     turns = [Rotation.from_matrix(rotation) for rotation, _ in motions]
-    apart = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
-    return motions[int(np.argmin(apart))]
+    median_angles = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
+    return motions[int(np.argmin(median_angles))]

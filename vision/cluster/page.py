@@ -40,12 +40,12 @@ def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm
     black += [line for cell, other in shape.folds for line in _between(cell, other, width, dashed=True)]
     columns, rows = shape.size
     name = f"{shape.name[0].upper()}{shape.name[1:]}, {dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
-    made = page((columns * width, rows * width), paper, name, black)
-    if made is None:
+    drawing = page((columns * width, rows * width), paper, name, black)
+    if drawing is None:
         around = Layout.around_mm
         room = max(min((w - around) / columns, (h - around) / rows) for w, h in sheets(paper)) / FACE_SIDES
         raise _too_large(f"{shape.name} with tags of {side_mm:g} mm", paper, room)
-    return made
+    return drawing
 
 
 def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
@@ -69,10 +69,10 @@ def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper:
         numbers.append(Text(x, y + width + Layout.text_mm + 0.5, f"{dictionary} {id}, {side_mm:g} mm"))
     rows = math.ceil(len(ids) / columns)
     name = f"{dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
-    made = page((columns * pitch - _Settings.gap_mm, rows * pitch), paper, name, black, numbers)
-    if made is None:
+    drawing = page((columns * pitch - _Settings.gap_mm, rows * pitch), paper, name, black, numbers)
+    if drawing is None:
         raise ConfigError(f"{len(ids)} tags of {side_mm:g} mm do not fit on {paper}", remedy="Print them on two pages")
-    return made
+    return drawing
 
 
 def _too_large(what: str, paper: str, room_mm: float) -> ConfigError:

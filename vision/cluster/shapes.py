@@ -57,8 +57,8 @@ class Shape:
     def cuts(self) -> list[tuple[Cell, Cell]]:
         """Pairs of a face's cell and the free cell beside it, between which the sheet is cut."""
         cells = {face.cell for face in self.faces}
-        beside = [(cell, (cell[0] + c, cell[1] + r)) for cell in sorted(cells) for c, r in _STEPS]
-        return [(cell, other) for cell, other in beside if other not in cells]
+        neighbours = [(cell, (cell[0] + c, cell[1] + r)) for cell in sorted(cells) for c, r in _STEPS]
+        return [(cell, other) for cell, other in neighbours if other not in cells]
 
     def placed(self, ids: Sequence[int], width_m: float) -> tuple[PlacedTag, ...]:
         """Return the poses on the body of the tags with these numbers, for faces of this width [m].

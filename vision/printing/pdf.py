@@ -10,8 +10,8 @@ POINT_MM = 25.4 / 72.0
 def pdf(page: Page) -> bytes:
     """Return the bytes of the file."""
     width, height = (side / POINT_MM for side in page.size_mm)
-    drawn = [*(_rectangle(each, page) for each in page.rectangles), "f", *(_text(each, page) for each in page.texts)]
-    stream = "\n".join(["0 g", *drawn]).encode("latin-1")
+    content = [*(_rectangle(each, page) for each in page.rectangles), "f", *(_text(each, page) for each in page.texts)]
+    stream = "\n".join(["0 g", *content]).encode("latin-1")
     return _file(
         b"<</Type/Catalog/Pages 2 0 R/ViewerPreferences<</PrintScaling/None>>>>",
         b"<</Type/Pages/Kids[3 0 R]/Count 1>>",

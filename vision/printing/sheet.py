@@ -94,11 +94,11 @@ def page(
     sheet = max(fitting, key=lambda each: min(each[0] - width, each[1] - height))
     x, y = (Layout.margin_mm + 0.5 * (side - own - Layout.around_mm) for side, own in zip(sheet, size_mm, strict=True))
     rulers = rulers_mm(size_mm)
-    below, beside = y + height + 0.35 * Layout.ruler_mm, x + width + 0.35 * Layout.ruler_mm
-    lines = [*_ruler(x, below, rulers[0], upright=False), *_ruler(beside, y, rulers[1], upright=True)]
-    told = f"Print at 100 %, then measure: this line is {rulers[0]:g} mm, the upright one {rulers[1]:g} mm."
-    words = [_line(said, x, below + 7.0 + k * 4.0, sheet[0]) for k, said in enumerate((told, name))]
-    words.append(Text(beside + 7.0, y + rulers[1], f"{rulers[1]:g} mm", turned=True))
+    below_y, right_x = y + height + 0.35 * Layout.ruler_mm, x + width + 0.35 * Layout.ruler_mm
+    lines = [*_ruler(x, below_y, rulers[0], upright=False), *_ruler(right_x, y, rulers[1], upright=True)]
+    instruction = f"Print at 100 %, then measure: this line is {rulers[0]:g} mm, the upright one {rulers[1]:g} mm."
+    words = [_line(caption, x, below_y + 7.0 + k * 4.0, sheet[0]) for k, caption in enumerate((instruction, name))]
+    words.append(Text(right_x + 7.0, y + rulers[1], f"{rulers[1]:g} mm", turned=True))
     moved = [Rectangle(x + r.x_mm, y + r.y_mm, r.width_mm, r.height_mm) for r in rectangles]
     written = [replace(text, x_mm=x + text.x_mm, y_mm=y + text.y_mm) for text in texts]
     return Page(sheet, (x, y), rulers, (*moved, *lines), (*written, *words))

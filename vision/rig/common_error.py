@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.vision.pose import turned
+from bodyschema.vision.pose import turn_jacobian
 
 from .lens import Lens
 from .rectified import Rectification
@@ -41,7 +41,7 @@ class CommonError:
     def errors(self, x: FloatArray) -> FloatArray:
         """Return the errors (n, 3, k) [m] at positions x (n, 3) [m], at 1 sigma of each of k independent unknowns."""
         x = self._within_view(x)
-        return self._raw(x) - turned(x) @ self._frame
+        return self._raw(x) - turn_jacobian(x) @ self._frame
 
     def variance(self, x: FloatArray) -> FloatArray:
         """Return the variance (n, 3) [m²] of each coordinate at positions x (n, 3) [m]."""
@@ -72,9 +72,9 @@ class CommonError:
 
     @cached_property
     def _frame(self) -> FloatArray:
-        """Rotation (3, k) [rad] of the frame for each unknown: the best fit over the view, after `turned`."""
+        """Rotation (3, k) [rad] of the frame for each unknown: the best fit over the view, after `turn_jacobian`."""
         errors = self._raw(self._grid)
-        turn = np.linalg.lstsq(turned(self._grid).reshape(-1, 3), errors.reshape(-1, errors.shape[2]))[0]
+        turn = np.linalg.lstsq(turn_jacobian(self._grid).reshape(-1, 3), errors.reshape(-1, errors.shape[2]))[0]
         return np.asarray(turn, np.float64)
 
     @cached_property

@@ -30,7 +30,7 @@ class LensSettings:
 
     iterations, converged = 30, 1e-12  # steps of Newton's method; a smaller step ends it [focal lengths]
     widest_rad = 1.5  # off the axis, beyond which a fisheye's polynomial says nothing
-    least_slope = 0.05  # lower bound of the derivative: keeps steps short where a lens folds over
+    min_slope = 0.05  # lower bound of the derivative: keeps steps short where a lens folds over
     # The largest x/z and y/z that a rectified image shows: beyond them a fisheye's image would be stretched too much.
     widest = 1.2
     rays = 64  # number of rays from the axis on which a lens is examined, and of points on each
@@ -124,7 +124,7 @@ class Lens:
             value = angle + (angle[..., None] ** powers) @ k
             slope = 1.0 + (angle[..., None] ** (powers - 1)) @ (k * powers)
             moved = np.clip(
-                angle - (value - seen) / np.maximum(slope, LensSettings.least_slope), 0.0, LensSettings.widest_rad
+                angle - (value - seen) / np.maximum(slope, LensSettings.min_slope), 0.0, LensSettings.widest_rad
             )
             done = np.max(np.abs(moved - angle), initial=0.0) < LensSettings.converged
             angle = moved
@@ -142,7 +142,7 @@ class Lens:
             (a, c), (b, d) = ((right - value) / h).T, ((down - value) / h).T
             u, v = (value - px).T
             # Where a lens folds the image over, there is no direction; the short step only keeps the result finite.
-            determinant = np.maximum(a * d - b * c, LensSettings.least_slope * self.focal_px[0] * self.focal_px[1])
+            determinant = np.maximum(a * d - b * c, LensSettings.min_slope * self.focal_px[0] * self.focal_px[1])
             step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
             found = found - step
             if np.max(np.abs(step), initial=0.0) < LensSettings.converged:

@@ -66,13 +66,13 @@ class Rectification:
             raise CalibrationError(self._why_no_view())
         focal = float(max((width - 1) / (high[0] - low[0]), (height - 1) / (high[1] - low[1])))
         centre = 0.5 * np.array([width - 1, height - 1]) - 0.5 * focal * (low + high)
-        own = float(np.mean([lens.focal_px for lens, _ in self.eyes]))
+        mean_focal_px = float(np.mean([lens.focal_px for lens, _ in self.eyes]))
         return StereoCalibration(
             focal_px=focal,
             principal_point_px=(float(centre[0]), float(centre[1])),
             baseline_m=0.0 if isinstance(self.rig, OneEyeRig) else self.rig.baseline_m,
             image_size_px=self.rig.image_size_px,
-            pixel_sigma=self.rig.made.held_out_px * focal / own,
+            pixel_sigma=self.rig.provenance.held_out_px * focal / mean_focal_px,
         )
 
     def points(self, px: FloatArray, eye: int) -> FloatArray:
@@ -83,7 +83,7 @@ class Rectification:
     def directions(self, px: FloatArray, eye: int) -> FloatArray:
         """Return the rectified directions (x/z, y/z) of an eye's image points, shape (n, 2)."""
         lens, R = self.eyes[eye]
-        return _turned(lens.directions(px), R)
+        return _rotated(lens.directions(px), R)
 
     def maps(self, eye: int) -> tuple[ImageArray, ImageArray]:
         """Return OpenCV's fixed-point maps that rectify the images of an eye (0 left, 1 right)."""
@@ -93,8 +93,8 @@ class Rectification:
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         px = np.stack([u.ravel(), v.ravel()], axis=1)
         ahead = (px - np.array(calibration.principal_point_px)) / calibration.focal_px
-        own = lens.project(np.column_stack([ahead, np.ones(len(ahead))]) @ R)
-        x, y = (own[:, k].reshape(height, width).astype(np.float32) for k in range(2))
+        raw_px = lens.project(np.column_stack([ahead, np.ones(len(ahead))]) @ R)
+        x, y = (raw_px[:, k].reshape(height, width).astype(np.float32) for k in range(2))
         return cv2.convertMaps(x, y, cv2.CV_16SC2)  # pyright: ignore
 
     def _why_no_view(self) -> str:
@@ -103,17 +103,17 @@ class Rectification:
                 f"the {self.rig.model} lens model folds over within the image. Calibrate again, with the board in the "
                 "image's corners too"
             )
-        apart = np.degrees(np.arccos(np.clip(self.eyes[-1][1][2] @ self.eyes[0][1][2], -1.0, 1.0)))
-        return f"the cameras share almost no view: their lines of sight are {apart:.0f}° apart. Turn them parallel"
+        angle_deg = np.degrees(np.arccos(np.clip(self.eyes[-1][1][2] @ self.eyes[0][1][2], -1.0, 1.0)))
+        return f"the cameras share almost no view: their lines of sight are {angle_deg:.0f}° apart. Turn them parallel"
 
     def _common_view(self) -> tuple[FloatArray, FloatArray]:
         """Return the limits (x/z, y/z) of the largest upright rectangle that all eyes' images fill."""
-        views = [_filled(lens, R, self.rig.image_size_px) for lens, R in self.eyes]
+        views = [_inscribed_view(lens, R, self.rig.image_size_px) for lens, R in self.eyes]
         low = np.max([view[0] for view in views], axis=0)
         return low, np.min([view[1] for view in views], axis=0)
 
 
-def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+def _inscribed_view(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return the limits (x/z, y/z) of an upright rectangle that one eye's image fills."""
     width, height = size_px
     along = np.linspace(0.0, 1.0, LensSettings.rays)
@@ -123,13 +123,13 @@ def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatA
         for x, y in ((ends, along), (along, ends), (ends + 1.0, along), (along, ends + 1.0))
     ]
     left, top, right, bottom = (
-        np.clip(_turned(lens.directions(side), R), -LensSettings.widest, LensSettings.widest) for side in sides
+        np.clip(_rotated(lens.directions(side), R), -LensSettings.widest, LensSettings.widest) for side in sides
     )
     low = np.array([left[:, 0].max(), top[:, 1].max()])
     return low, np.array([right[:, 0].min(), bottom[:, 1].min()])
 
 
-def _turned(directions: FloatArray, R: FloatArray) -> FloatArray:
+def _rotated(directions: FloatArray, R: FloatArray) -> FloatArray:
     turned = np.column_stack([directions, np.ones(len(directions))]) @ R.T
     return turned[:, :2] / turned[:, 2:]
 

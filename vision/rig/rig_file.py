@@ -17,7 +17,7 @@ from bodyschema.robot.toml_file import Positive, convert, line_of, read_toml
 from bodyschema.robot.toml_text import toml_text
 
 from .lens import DISTORTION_NAMES, Lens, Model
-from .stereo_rig import Made, OneEyeRig, Rig, StereoRig, parameter_names
+from .stereo_rig import CalibrationProvenance, OneEyeRig, Rig, StereoRig, parameter_names
 
 FORMAT, FORMAT_OF_ONE = "bodyschema stereo rig 1", "bodyschema camera 1"
 _AGAIN = "Take the file from a copy, or calibrate again: `bodyschema calibrate cameras`"
@@ -40,7 +40,7 @@ class _Right(msgspec.Struct, forbid_unknown_fields=True):
     translation_m: tuple[Place, Place, Place]
 
 
-class _Made(msgspec.Struct, forbid_unknown_fields=True):
+class _Provenance(msgspec.Struct, forbid_unknown_fields=True):
     date: str
     board: str
     views: Annotated[int, Meta(ge=1)]
@@ -63,7 +63,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     left: _Eye
     right: _Eye
     right_from_left: _Right
-    made: _Made
+    made: _Provenance
     uncertainty: _Uncertainty
 
 
@@ -72,7 +72,7 @@ class _FileOfOne(msgspec.Struct, forbid_unknown_fields=True):
     model: Model
     image_size_px: tuple[Pixels, Pixels]
     camera: _Eye
-    made: _Made
+    made: _Provenance
     uncertainty: _Uncertainty
 
 
@@ -126,7 +126,7 @@ def _text(rig: Rig) -> str:
         "model": rig.model,
         "image_size_px": rig.image_size_px,
         **eyes,
-        "made": {name: getattr(rig.made, name) for name in Made.__dataclass_fields__},
+        "made": {name: getattr(rig.provenance, name) for name in CalibrationProvenance.__dataclass_fields__},
         "uncertainty": {
             "names": rig.names,
             "sigma": [float(f"{each:.6g}") for each in sigma],
@@ -151,9 +151,9 @@ def _checked(found: _File | _FileOfOne, file: Path, text: str) -> Rig:
 
     eyes = {"camera": found.camera} if isinstance(found, _FileOfOne) else {"left": found.left, "right": found.right}
     for name, eye in eyes.items():
-        wanted = len(DISTORTION_NAMES[found.model])
-        if len(eye.distortion) != wanted:
-            raise wrong(f"{len(eye.distortion)} coefficients, {found.model} has {wanted}", name, "distortion")
+        expected = len(DISTORTION_NAMES[found.model])
+        if len(eye.distortion) != expected:
+            raise wrong(f"{len(eye.distortion)} coefficients, {found.model} has {expected}", name, "distortion")
         for at, size in zip(eye.principal_point_px, found.image_size_px, strict=True):
             if not 0 <= at <= size:
                 raise wrong(f"{at:g} is outside an image of {found.image_size_px}", name, "principal_point_px")
@@ -172,7 +172,7 @@ def _checked(found: _File | _FileOfOne, file: Path, text: str) -> Rig:
     except ValueError as error:
         raise wrong(str(error), "uncertainty", "correlation") from error
     lenses = [Lens(found.model, e.focal_px, e.principal_point_px, e.distortion) for e in eyes.values()]
-    made = Made(**msgspec.structs.asdict(found.made))
+    made = CalibrationProvenance(**msgspec.structs.asdict(found.made))
     if isinstance(found, _FileOfOne):
         return OneEyeRig(lenses[0], found.image_size_px, (found.camera.serial,), covariance, made)
     left, right = lenses

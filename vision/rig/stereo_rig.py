@@ -26,7 +26,7 @@ class OtherCameras(CalibrationError, SourceError):
 
 
 @dataclass(frozen=True)
-class Made:
+class CalibrationProvenance:
     """Provenance of a calibration."""
 
     date: str  # ISO 8601 in UTC
@@ -53,7 +53,7 @@ class StereoRig:
     image_size_px: tuple[int, int]  # width and height of both eyes' images
     serials: tuple[str, str]  # serial numbers of the left and the right device; "" if unknown
     covariance: FloatArray  # of `vector`, shape (p, p)
-    made: Made  # provenance
+    provenance: CalibrationProvenance  # provenance
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad", "translation_m", "covariance"):
@@ -99,7 +99,7 @@ class StereoRig:
         """Return the rig with other parameters, all else the same."""
         left, right, rotation, translation = split(self.model, vector)
         return StereoRig(
-            left, right, rotation, translation, self.image_size_px, self.serials, self.covariance, self.made
+            left, right, rotation, translation, self.image_size_px, self.serials, self.covariance, self.provenance
         )
 
     def require(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
@@ -131,7 +131,7 @@ class OneEyeRig:
     image_size_px: tuple[int, int]  # width and height of its images
     serials: tuple[str]  # serial number of the device; "" if unknown
     covariance: FloatArray  # of `vector`, shape (p, p)
-    made: Made  # provenance
+    provenance: CalibrationProvenance  # provenance
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", frozen_array(self.covariance))

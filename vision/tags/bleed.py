@@ -18,7 +18,7 @@ from scipy.special import ndtr
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
-from .edge import SQUARE, Mask, leave, sampled
+from .edge import SQUARE, Mask, sample_levels, touches_border
 from .settings import BleedSettings as _Settings
 from .settings import TagSettings
 
@@ -36,7 +36,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
         blur_px: 1-sigma.
         modules: the tag's modules with its black border (n, n), 1 white and 0 black.
     """
-    unseen = 0.0, (_Settings.usual * blur_px) ** 2
+    prior = 0.0, (_Settings.total_variance * blur_px) ** 2
     length = float(len(modules))
     to_px = cv2.getPerspectiveTransform(length * SQUARE, corners_px.astype(np.float32))
     sides = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1) / length
@@ -45,44 +45,51 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     counts = [int(min(round((length - 1.0) * module), _Settings.most_samples)) for module in (width, height)]
     x, y = (0.5 + (np.arange(count) + 0.5) * (length - 1.0) / count for count in counts)
     across, down = np.meshgrid(x, y)
-    there = np.asarray(to_px, np.float64) @ np.stack([across.ravel(), down.ravel(), np.ones(across.size)])
-    spots = there[:2] / there[2]
-    if leave(grey, spots):
-        return unseen
-    levels = sampled(grey, spots)
+    homogeneous = np.asarray(to_px, np.float64) @ np.stack([across.ravel(), down.ravel(), np.ones(across.size)])
+    positions = homogeneous[:2] / homogeneous[2]
+    if touches_border(grey, positions):
+        return prior
+    levels = sample_levels(grey, positions)
     printed = np.pad(modules, 1, constant_values=1.0)
     half = 0.5 * length
     right, below = across / half - 1.0, down / half - 1.0
-    lit = np.stack([np.ones_like(right), right, below])
+    light_basis = np.stack([np.ones_like(right), right, below])
 
     def pattern_at(bled_px: float) -> tuple[FloatArray, FloatArray]:
         # The grid itself comes from edges that have bled towards the tag's middle.
         shifts = bled_px / width, bled_px / height
         true = [half + (at - half) * (1.0 - shift / half) for at, shift in zip((x, y), shifts, strict=True)]
         (white, wide), (white_y, wide_y) = map(_blurred, true, shifts, (width, height), [blur_px] * 2, [length] * 2)
-        drawn = _bled(printed, bled_px)
-        return white_y @ drawn @ white.T, white_y @ drawn @ wide.T + wide_y @ drawn @ white.T
+        rendered = _bled(printed, bled_px)
+        return white_y @ rendered @ white.T, white_y @ rendered @ wide.T + wide_y @ rendered @ white.T
 
-    fit = _fitted(levels, lit, pattern_at, _Settings.step_share * blur_px)
+    fit = _fitted(levels, light_basis, pattern_at, _Settings.step_share * blur_px)
     if fit is None or not abs(fit.moved) < _Settings.widest * min(width, height):
-        return unseen
+        return prior
     moved, found, cov, design, kept = fit
     # Influence of a module on the shift: its samples share pixels, print and light.
-    pulls = (cov[7] @ design * kept * (levels - found @ design)).reshape(across.shape)
+    influences = (cov[7] @ design * kept * (levels - found @ design)).reshape(across.shape)
     rows, columns = (np.flatnonzero(np.diff(np.floor(at), prepend=-1.0)) for at in (y, x))
-    pulls = np.add.reduceat(np.add.reduceat(pulls, rows, axis=0), columns, axis=1)
-    by_chance = float(np.square(pulls).sum() / found[3] ** 2) * pulls.size / (pulls.size - len(design))
-    if not by_chance > 0.0:
-        return unseen
+    influences = np.add.reduceat(np.add.reduceat(influences, rows, axis=0), columns, axis=1)
+    chance_variance = (
+        float(np.square(influences).sum() / found[3] ** 2) * influences.size / (influences.size - len(design))
+    )
+    if not chance_variance > 0.0:
+        return prior
     # Many cameras do not bleed at all. The probability of bleeding follows from two densities of the estimate: by
     # chance alone, and by chance with the usual bleeding.
-    usual = unseen[1] + by_chance
-    odds = math.sqrt(by_chance / usual) * math.exp(min(0.5 * moved * moved * (1.0 / by_chance - 1.0 / usual), 500.0))
-    bleeds = odds / (1.0 + odds)
-    share = unseen[1] / usual
+    total_variance = prior[1] + chance_variance
+    odds = math.sqrt(chance_variance / total_variance) * math.exp(
+        min(0.5 * moved * moved * (1.0 / chance_variance - 1.0 / total_variance), 500.0)
+    )
+    probability = odds / (1.0 + odds)
+    share = prior[1] / total_variance
     moved *= share
-    variance = bleeds * (share * by_chance + (_Settings.unlike * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
-    return bleeds * moved, variance
+    variance = (
+        probability * (share * chance_variance + (_Settings.unlike * moved) ** 2)
+        + probability * (1.0 - probability) * moved * moved
+    )
+    return probability * moved, variance
 
 
 class _Fit(NamedTuple):
@@ -96,7 +103,10 @@ class _Fit(NamedTuple):
 
 
 def _fitted(
-    levels: FloatArray, lit: FloatArray, pattern_at: Callable[[float], tuple[FloatArray, FloatArray]], step_px: float
+    levels: FloatArray,
+    light_basis: FloatArray,
+    pattern_at: Callable[[float], tuple[FloatArray, FloatArray]],
+    step_px: float,
 ) -> _Fit | None:
     """Fit levels (n,) by the pattern at the shift that explains them best; return None if something covers it."""
     moved, kept = 0.0, np.ones(levels.shape, np.bool_)
@@ -104,7 +114,7 @@ def _fitted(
     for _ in range(_Settings.rounds):
         pattern, wider = pattern_at(moved)
         bled = (pattern_at(moved + step_px)[0] - pattern) / step_px
-        design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1)
+        design = np.concatenate([light_basis, light_basis * pattern, [wider, bled]]).reshape(8, -1)
         try:
             found = np.linalg.solve((design * kept) @ design.T, design @ (levels * kept))
             kept = np.abs(levels - found @ design) < 0.5 * found[3]  # the rest show the other colour
@@ -130,9 +140,9 @@ def _bled(printed: FloatArray, bled_px: float) -> FloatArray:
     taken = np.maximum if bled_px >= 0.0 else np.minimum
     rows = np.empty((2 * len(printed) - 1, len(printed)))
     rows[::2], rows[1::2] = printed, taken(printed[1:], printed[:-1])
-    drawn = np.empty((len(rows), len(rows)))
-    drawn[:, ::2], drawn[:, 1::2] = rows, taken(rows[:, 1:], rows[:, :-1])
-    return drawn
+    rendered = np.empty((len(rows), len(rows)))
+    rendered[:, ::2], rendered[:, 1::2] = rows, taken(rows[:, 1:], rows[:, :-1])
+    return rendered
 
 
 def _blurred(

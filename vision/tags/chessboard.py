@@ -53,18 +53,18 @@ class ChessboardFinder:
         grid = any_grid(grey)
         if grid is None:
             return None
-        wanted = sorted((self._board.rows - 1, self._board.columns - 1))
-        if list(grid.shape[:2]) == wanted:
+        expected = sorted((self._board.rows - 1, self._board.columns - 1))
+        if list(grid.shape[:2]) == expected:
             return self._measured(grey, grid if self._board.columns > self._board.rows else grid.transpose(1, 0, 2))
-        if grid.shape[0] <= wanted[0] and grid.shape[1] <= wanted[1]:
+        if grid.shape[0] <= expected[0] and grid.shape[1] <= expected[1]:
             return Reason.OCCLUDED
         return self._other(f"{grid.shape[1] + 1}x{grid.shape[0] + 1}")
 
     def _other(self, squares: str) -> Reason:
         if not self._warned:
             self._warned = True
-            wanted = f"{self._board.columns}x{self._board.rows}"
-            _log.warning("a chessboard of %s squares is in view, not one of %s", squares, wanted)
+            expected = f"{self._board.columns}x{self._board.rows}"
+            _log.warning("a chessboard of %s squares is in view, not one of %s", squares, expected)
         return Reason.REPROJECTION
 
     def _measured(self, grey: ImageArray, rough_px: FloatArray) -> TagImage | Reason:
@@ -78,7 +78,7 @@ class ChessboardFinder:
         variance = self._variance(px)
         grid = px.reshape(self._board.rows - 1, self._board.columns - 1, 2)
         side_px = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).mean()) for axis in (0, 1))
-        if variance > (TagSettings.most_corner_sigma * side_px) ** 2:
+        if variance > (TagSettings.max_corner_sigma * side_px) ** 2:
             return Reason.NOT_STRAIGHT
         return TagImage(0, px, variance * np.eye(px.size))
 
@@ -103,7 +103,7 @@ class ChessboardFinder:
         dark = (columns + rows) % 2 == 0
         inner = np.s_[1:-1, 1:-1]
         contrast = levels[inner][~dark[inner]].mean() - levels[inner][dark[inner]].mean()
-        if contrast < EdgeSettings.least_contrast:
+        if contrast < EdgeSettings.min_contrast:
             return Reason.LOW_CONTRAST
         # A margin has 0 of the contrast, another row of squares all of it: 0.3 to 0.85 change no outcome of the tests.
         for side in (np.s_[0, 1:-1], np.s_[-1, 1:-1], np.s_[1:-1, 0], np.s_[1:-1, -1]):

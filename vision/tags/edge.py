@@ -43,7 +43,7 @@ class Edges:
 
     Attributes:
         origins, along, normals: middles of the edges (4, 2) [px], and their directions along and outward.
-        half_lengths, places, slopes: (4,) [px].
+        half_lengths, offsets, slopes: (4,) [px].
         scatter: covariance (4, 2, 2) of place and slope [px²] from the points' scatter, if they were independent.
         shared: covariance (4, 2, 2) of the error common to all points of an edge [px²].
         residuals: residuals of each edge's points in units of their scatter; 0 where a point was left out.
@@ -57,7 +57,7 @@ class Edges:
     along: FloatArray
     normals: FloatArray
     half_lengths: FloatArray
-    places: FloatArray
+    offsets: FloatArray
     slopes: FloatArray
     scatter: FloatArray
     shared: FloatArray
@@ -70,7 +70,7 @@ class Edges:
     @property
     def points(self) -> FloatArray:
         """The middle of each measured edge (4, 2) [px]."""
-        return self.origins + self.places[:, None] * self.normals
+        return self.origins + self.offsets[:, None] * self.normals
 
     @property
     def directions(self) -> FloatArray:
@@ -125,59 +125,59 @@ class _Points:
     """Points of the edges on the lines across them.
 
     Attributes:
-        places: position of the edge on each line, outward (4, n) [px], for the fit of the edge's place.
-        steady: the same, for the fit of the edge's slope.
-        clear: mask (4, n) of the lines that show black and white.
-        beyond: correction for the modules beyond (4, n) [px].
-        unlit: variances (4, 2) of the fitted place and slope due to the uncertainty of the light [px²].
+        offsets: position of the edge on each line, outward (4, n) [px], for the fit of the edge's place.
+        slope_offsets: the same, for the fit of the edge's slope.
+        has_contrast: mask (4, n) of the lines that show black and white.
+        beyond_correction: correction for the modules beyond (4, n) [px].
+        light_variance: variances (4, 2) of the fitted place and slope due to the uncertainty of the light [px²].
         widening, information, levels: see `Edges`.
     """
 
-    places: FloatArray
-    steady: FloatArray
-    clear: Mask
-    beyond: FloatArray
-    unlit: FloatArray
+    offsets: FloatArray
+    slope_offsets: FloatArray
+    has_contrast: Mask
+    beyond_correction: FloatArray
+    light_variance: FloatArray
     widening: float
     information: float
     levels: FloatArray
 
 
 def find_edges(
-    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, shorter: float
+    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, length_share: float
 ) -> Edges | Reason:
     """Measure the edges from each corner to the next one, or return the reason why one cannot be measured.
 
     Args:
         light: None if the corners may be wrong by pixels.
-        shorter: length of the lines across the edges, relative to the usual one.
+        length_share: length of the lines across the edges, relative to the usual one.
     """
     begin, end = corners_px, corners_px[[1, 2, 3, 0]]
     lengths = np.linalg.norm(end - begin, axis=1)
-    if lengths.min() < _Settings.fewest_points:
+    if lengths.min() < _Settings.min_points:
         return Reason.NO_MARKER
     along = (end - begin) / lengths[:, None]
     normals = np.column_stack([along[:, 1], -along[:, 0]])  # corners go round clockwise: out of the tag
     origins = (begin + end) / 2.0
-    rays = _rays(corners_px, origins, along, normals, lengths, blur_px, shorter, rough=light is None)
+    rays = _rays(corners_px, origins, along, normals, lengths, blur_px, length_share, rough=light is None)
     if isinstance(rays, Reason):
         return rays
-    if leave(grey, rays.spots):
+    if touches_border(grey, rays.spots):
         return Reason.AT_BORDER
-    profiles = sampled(grey, rays.spots)
+    profiles = sample_levels(grey, rays.spots)
     if light is None:
         points = _rough_points(profiles, rays, blur_px)
     else:
-        ways = np.stack([0.5 * lengths[:, None] * along, normals], axis=2)
-        unlit = np.einsum("eiw,kij,ejw->ekw", ways, light.cov, ways)
-        beyond = sampled(grey, _within(grey, rays.beyond))
-        ideal = _ideal(rays.spots, origins, normals, blur_px)
+        axes = np.stack([0.5 * lengths[:, None] * along, normals], axis=2)
+        light_variance = np.einsum("eiw,kij,ejw->ekw", axes, light.cov, axes)
+        beyond = sample_levels(grey, _clamped(grey, rays.beyond))
+        ideal = _ideal_levels(rays.spots, origins, normals, blur_px)
         cumulants = PIXEL_CUMULANT * (normals**4).sum(axis=1) / blur_px**4
-        lit = light.gradients @ ways
-        points = _points(profiles, ideal, rays, beyond, blur_px, cumulants, lit, unlit)
+        light_slopes = light.gradients @ axes
+        points = _points(profiles, ideal, rays, beyond, blur_px, cumulants, light_slopes, light_variance)
     if isinstance(points, Reason):
         return points
-    fitted = _fitted(rays, points)
+    fitted = _fit_lines(rays, points)
     if isinstance(fitted, Reason):
         return fitted
     ends = np.stack([rays.s[:, 0], rays.s.max(axis=1)], axis=1)[..., None]
@@ -194,7 +194,7 @@ def _rays(
     normals: FloatArray,
     lengths: FloatArray,
     blur_px: float,
-    shorter: float,
+    length_share: float,
     *,
     rough: bool,
 ) -> _Rays | Reason:
@@ -206,13 +206,13 @@ def _rays(
     modules = np.abs(_module_ends(to_modules, quads[:, :2].mT, normals)).min(axis=(1, 2))
     share = _Settings.clear_share * modules
     clear = np.minimum(np.maximum(modules - _Settings.clear_blurs * blur_px, share), _Settings.longest_reach_px)
-    reaches = shorter * (np.maximum(clear, share) if rough else clear)
+    reaches = length_share * (np.maximum(clear, share) if rough else clear)
     # At an acute corner, nearby lines leave the tag through its other side.
     sides = quads[:, [3, 2]] - quads[:, :2]
     leaning = (sides * along[:, None]).sum(axis=2) / (sides * normals[:, None]).sum(axis=2)
     free = _Settings.corner_blurs * blur_px + np.maximum(leaning * np.outer(reaches, (-1.0, 1.0)), 0.0)
-    counts = np.minimum((lengths - free.sum(axis=1)).astype(np.intp), _Settings.most_points)
-    if counts.min() < _Settings.fewest_points:
+    counts = np.minimum((lengths - free.sum(axis=1)).astype(np.intp), _Settings.max_points)
+    if counts.min() < _Settings.min_points:
         return Reason.NO_MARKER
     number = np.arange(counts.max())
     first, last = (2.0 * free / lengths[:, None] - 1.0).T * np.array([[1.0], [-1.0]])
@@ -224,8 +224,8 @@ def _rays(
     points = origins[..., None] + (0.5 * lengths[:, None] * along)[..., None] * s[:, None]
     ends = _module_ends(to_modules, points, normals)
     spots = points.swapaxes(0, 1)[..., None] + normals.T[..., None, None] * steps[:, None]
-    there = points[:, :, None] + ends[:, None] * normals[..., None, None]
-    beyond = np.empty((2, 0)) if rough else _beyond(to_px, to_modules, there)
+    module_ends = points[:, :, None] + ends[:, None] * normals[..., None, None]
+    beyond = np.empty((2, 0)) if rough else _beyond(to_px, to_modules, module_ends)
     weights = (sample < samples).astype(np.float64)
     return _Rays(s, number < counts[:, None], counts, steps, weights, spots, ends, beyond)
 
@@ -237,8 +237,8 @@ def _module_ends(to_modules: FloatArray, points: FloatArray, normals: FloatArray
     """
     depths = np.array([[1.0], [-1.0]])
     lines = to_modules[:, None, 1] - depths * to_modules[:, None, 2]  # (4, 2, 3)
-    there = lines[..., :2] @ points + lines[..., 2:]
-    return np.asarray(-there / (lines[..., :2] @ normals[..., None]), np.float64)
+    values = lines[..., :2] @ points + lines[..., 2:]
+    return np.asarray(-values / (lines[..., :2] @ normals[..., None]), np.float64)
 
 
 def _beyond(to_px: FloatArray, to_modules: FloatArray, places: FloatArray) -> FloatArray:
@@ -250,23 +250,23 @@ def _beyond(to_px: FloatArray, to_modules: FloatArray, places: FloatArray) -> Fl
     row, weight = (to_modules[:, ::2, :2] @ places.reshape(4, 2, -1) + to_modules[:, ::2, 2:]).swapaxes(0, 1)
     columns = np.clip(row / weight, 0.5, MODULES - 0.5)
     depths = np.repeat([1.5, -1.5], count)
-    there = to_px[..., :1] * columns[:, None] + (to_px[..., 1:2] * depths + to_px[..., 2:])
-    return np.asarray(there[:, :2] / there[:, 2:], dtype=np.float64).swapaxes(0, 1).reshape(2, 4, 2, count)
+    centres = to_px[..., :1] * columns[:, None] + (to_px[..., 1:2] * depths + to_px[..., 2:])
+    return np.asarray(centres[:, :2] / centres[:, 2:], dtype=np.float64).swapaxes(0, 1).reshape(2, 4, 2, count)
 
 
-def leave(grey: ImageArray, places: FloatArray) -> bool:
+def touches_border(grey: ImageArray, places: FloatArray) -> bool:
     """Return True if some places, u and v (2, ...), are too near to the image's border to be sampled."""
     height, width = grey.shape
     return bool(places.min() < 1.0 or places[0].max() > width - 2.0 or places[1].max() > height - 2.0)
 
 
-def _within(grey: ImageArray, places: FloatArray) -> FloatArray:
+def _clamped(grey: ImageArray, places: FloatArray) -> FloatArray:
     """Return the places, u and v (2, ...), each clipped to the nearest one that can be sampled."""
     height, width = grey.shape
     return np.stack([np.clip(places[0], 1.0, width - 2.0), np.clip(places[1], 1.0, height - 2.0)])
 
 
-def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
+def sample_levels(grey: ImageArray, places: FloatArray) -> FloatArray:
     """Return the grey levels at places, u and v (2, ...)."""
     # By hand: cv2.remap would round places to 1/32 px.
     whole = places.astype(np.intp)
@@ -276,7 +276,7 @@ def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
     return _interpolated([pixels[first + more].astype(np.float64) for more in (0, 1, width, width + 1)], places - whole)
 
 
-def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px: float) -> FloatArray:
+def _ideal_levels(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px: float) -> FloatArray:
     """Return the shares of white of edges through `origins` at places (2, 4, n, m), interpolated from pixels."""
     # Interpolation adds to the pixels' own blur.
     normals = normals / math.sqrt(max(blur_px**2, _Settings.sharpest_px**2) - INTERPOLATION)
@@ -301,7 +301,7 @@ def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float) -> _Points 
     number = np.arange(rays.weights.shape[1])
     ends = np.stack([number < plain, (number >= samples - plain) & (number < samples)], axis=1) / plain[..., None]
     black, white = np.einsum("enm,ekm,en->ke", profiles, ends, rays.used) / rays.counts
-    if (white - black).min() < 0.5 * _Settings.least_contrast:
+    if (white - black).min() < 0.5 * _Settings.min_contrast:
         return Reason.LOW_CONTRAST
     step = rays.steps[:, 1] - rays.steps[:, 0]
     shares = (white[:, None, None] - profiles) / (white - black)[:, None, None]
@@ -323,7 +323,7 @@ def _points(
     blur_px: float,
     cumulants: FloatArray,
     gradients: FloatArray,
-    unlit: FloatArray,
+    light_variance: FloatArray,
 ) -> _Points | Reason:
     """Return the edges' points on the lines across them, or the reason why there are none: too little contrast.
 
@@ -333,7 +333,7 @@ def _points(
         beyond: grey levels (4, 2, n) beyond the ends of black border and margin.
         cumulants: fourth cumulant (4,) of the blur across each edge, in units of `blur_px`.
         gradients: change of black and white (4, 2, 2) per unit of s [grey levels] and of `steps` [grey levels/px].
-        unlit: variances of the gradients (4, 2, 2).
+        light_variance: variances of the gradients (4, 2, 2).
     """
     filters, steady, information = _filters(rays.steps, rays.weights, blur_px)
     s = rays.s[..., None]
@@ -345,42 +345,60 @@ def _points(
         return np.asarray(constant + slope * s, np.float64)
 
     side = ndtr(rays.steps / blur_px)[:, None]
-    lit = gradients[:, None, :, 0] * s
+    light_shift = gradients[:, None, :, 0] * s
     slopes = gradients[:, None, :, 1:] * rays.steps[:, None, None]
-    profiles = profiles - (lit[..., :1] + slopes[:, :, 0]) * (1.0 - side) - (lit[..., 1:] + slopes[:, :, 1]) * side
+    profiles = (
+        profiles
+        - (light_shift[..., :1] + slopes[:, :, 0]) * (1.0 - side)
+        - (light_shift[..., 1:] + slopes[:, :, 1]) * side
+    )
     black, white = np.moveaxis(levels(profiles), 2, 0)
-    if rays.mean(white - black).min() < _Settings.least_contrast:
+    if rays.mean(white - black).min() < _Settings.min_contrast:
         return Reason.LOW_CONTRAST
     around = rays.steps[:, None]
     cumulant = cumulants[:, None, None]
     inner, outer = rays.ends.swapaxes(0, 1)[..., None]
-    shown = (beyond[:, 0] - black)[..., None] * blurred_step((inner - around) / blur_px, cumulant)
-    shown += (beyond[:, 1] - white)[..., None] * blurred_step((around - outer) / blur_px, cumulant)
-    cleared = profiles - shown
-    fitted = levels(cleared)
+    neighbours = (beyond[:, 0] - black)[..., None] * blurred_step((inner - around) / blur_px, cumulant)
+    neighbours += (beyond[:, 1] - white)[..., None] * blurred_step((around - outer) / blur_px, cumulant)
+    corrected = profiles - neighbours
+    fitted = levels(corrected)
     contrast = fitted[..., 1] - fitted[..., 0]
-    usual = rays.mean(contrast)[:, None]
-    if usual.min() < _Settings.least_contrast:
+    mean_contrast = rays.mean(contrast)[:, None]
+    if mean_contrast.min() < _Settings.min_contrast:
         return Reason.LOW_CONTRAST
-    contrast = np.maximum(contrast, 0.5 * usual)
-    own = cleared @ filters.mT
+    contrast = np.maximum(contrast, 0.5 * mean_contrast)
+    amplitudes = corrected @ filters.mT
     # Pixels shift and widen an ideal edge, too.
-    shift, wider = np.moveaxis(own[..., 2:] / contrast[..., None] - ideal @ filters[:, 2:].mT, 2, 0)
-    level = rays.mean(own[..., 0])[:, None, None] * (1.0 - side) + rays.mean(own[..., 1])[:, None, None] * side
+    shift, wider = np.moveaxis(amplitudes[..., 2:] / contrast[..., None] - ideal @ filters[:, 2:].mT, 2, 0)
+    level = (
+        rays.mean(amplitudes[..., 0])[:, None, None] * (1.0 - side)
+        + rays.mean(amplitudes[..., 1])[:, None, None] * side
+    )
     across = steady[..., None]
-    held = ((cleared - level) @ across)[..., 0] / contrast - ((ideal - side) @ across)[..., 0]
-    clear = rays.used & (own[..., 1] - own[..., 0] > 0.5 * contrast)
-    squared = np.square(contrast) * clear * information[:, None]
-    correction = -(shown @ filters[:, 2, :, None])[..., 0] / contrast
+    slope_shift = ((corrected - level) @ across)[..., 0] / contrast - ((ideal - side) @ across)[..., 0]
+    has_contrast = rays.used & (amplitudes[..., 1] - amplitudes[..., 0] > 0.5 * contrast)
+    squared = np.square(contrast) * has_contrast * information[:, None]
+    correction = -(neighbours @ filters[:, 2, :, None])[..., 0] / contrast
     # Both edges across a gradient move the same way: their errors add, which the factor accounts for.
     sides = np.concatenate([1.0 - side, side], axis=1)
-    pulls = np.stack(
+    light_response = np.stack(
         [((sides * around) @ filters[:, 2, :, None])[..., 0], (sides @ across)[..., 0]], axis=2
     )  # (4, 2, 2)
-    doubt = 2.0 * (np.square(pulls / usual[..., None]) * unlit[..., ::-1]).sum(axis=1)
-    shown_levels = fitted + lit
+    light_variances = 2.0 * (np.square(light_response / mean_contrast[..., None]) * light_variance[..., ::-1]).sum(
+        axis=1
+    )
+    shown_levels = fitted + light_shift
     ends = np.stack([shown_levels[:, 0], shown_levels[np.arange(4), rays.counts - 1]], axis=1)
-    return _Points(shift, held, clear, correction, doubt, float((wider * squared).sum()), float(squared.sum()), ends)
+    return _Points(
+        shift,
+        slope_shift,
+        has_contrast,
+        correction,
+        light_variances,
+        float((wider * squared).sum()),
+        float(squared.sum()),
+        ends,
+    )
 
 
 def blurred_step(places: FloatArray, cumulant: float | FloatArray) -> FloatArray:
@@ -432,44 +450,48 @@ def _line_filters(s: FloatArray, kept: Mask) -> FloatArray:
     )
 
 
-def _fitted(
+def _fit_lines(
     rays: _Rays, points: _Points
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, tuple[FloatArray, ...]] | Reason:
     """Fit lines through the points; return the reason if none can be fitted.
 
-    The result is `places`, `slopes`, `scatter`, `shared` and `residuals`, see `Edges`.
+    The result is `offsets`, `slopes`, `scatter`, `shared` and `residuals`, see `Edges`.
     """
-    kept = points.clear
-    fewest = np.maximum(_Settings.least_visible * rays.counts, _Settings.fewest_points - 1)
+    kept = points.has_contrast
+    needed = np.maximum(_Settings.min_visible * rays.counts, _Settings.min_points - 1)
     for _ in range(3):
-        if (kept.sum(axis=1) < fewest).any():
+        if (kept.sum(axis=1) < needed).any():
             return Reason.OCCLUDED
-        line = _line_filters(rays.s, kept) @ points.steady[..., None]
-        far = np.abs(points.steady - line[:, 0] - line[:, 1] * rays.s)
-        most = np.maximum(_Settings.stray_medians * _medians(far, kept), _Settings.wavy_px)
-        agreeing = points.clear & (far <= most[:, None])
-        if (agreeing == kept).all():
+        line = _line_filters(rays.s, kept) @ points.slope_offsets[..., None]
+        distance = np.abs(points.slope_offsets - line[:, 0] - line[:, 1] * rays.s)
+        limit = np.maximum(_Settings.stray_medians * _medians(distance, kept), _Settings.wavy_px)
+        inliers = points.has_contrast & (distance <= limit[:, None])
+        if (inliers == kept).all():
             break
-        kept = agreeing
+        kept = inliers
     filters = _line_filters(rays.s, kept)
-    both = np.stack([points.places, points.steady], axis=2)
-    lines = filters @ both  # (4, 2, 2)
-    residuals = (both - lines[:, None, 0] - lines[:, None, 1] * rays.s[..., None]) * kept[..., None]
+    offset_pairs = np.stack([points.offsets, points.slope_offsets], axis=2)
+    lines = filters @ offset_pairs  # (4, 2, 2)
+    residuals = (offset_pairs - lines[:, None, 0] - lines[:, None, 1] * rays.s[..., None]) * kept[..., None]
     freedom = kept.sum(axis=1) - 2.0
     squares = np.maximum(np.square(residuals).sum(axis=1), freedom[:, None] * _Settings.floor_px**2)
     # With few points the scatter may be larger than estimated: this is the variance of Student's t.
     sigmas = np.sqrt(squares / np.maximum(freedom - 2.0, 1.0)[:, None])
     scatter = sigmas[:, :, None] * (filters @ filters.mT) * sigmas[:, None]
-    beyond = filters @ points.beyond[..., None]
+    beyond_correction = filters @ points.beyond_correction[..., None]
     floor = np.maximum(_Settings.floor_px**2 - scatter, 0.0) * np.eye(2)
-    shared = floor + _Settings.beyond_share**2 * beyond @ beyond.mT + points.unlit[..., None] * np.eye(2)
-    waves = residuals[..., 1] * np.sqrt(freedom / squares[:, 1])[:, None]
+    shared = (
+        floor
+        + _Settings.beyond_share**2 * beyond_correction @ beyond_correction.mT
+        + points.light_variance[..., None] * np.eye(2)
+    )
+    normalised = residuals[..., 1] * np.sqrt(freedom / squares[:, 1])[:, None]
     return (
         lines[:, 0, 0],
         lines[:, 1, 1],
         scatter,
         shared,
-        tuple(w[:k] for w, k in zip(waves, rays.counts, strict=True)),
+        tuple(w[:k] for w, k in zip(normalised, rays.counts, strict=True)),
     )
 
 

@@ -47,12 +47,12 @@ class TagFinder:
         names = ["", *self._others]
         name = names[self._suspect]
         if not name:
-            wanted = {id for id, _ in _seen(self._detector, np.ascontiguousarray(grey[:, ::-1]))} & set(self._ids)
-            reason = Reason.MIRRORED if wanted else None
+            mirrored_ids = {id for id, _ in _seen(self._detector, np.ascontiguousarray(grey[:, ::-1]))} & set(self._ids)
+            reason = Reason.MIRRORED if mirrored_ids else None
         else:
             detector = _detector(cv2.aruco.getPredefinedDictionary(self._others[name]), exact=True)
             large = [
-                quad for _, quad in _seen(detector, grey) if cv2.arcLength(quad, True) > 4.0 * _Settings.least_side_px
+                quad for _, quad in _seen(detector, grey) if cv2.arcLength(quad, True) > 4.0 * _Settings.min_side_px
             ]
             reason = Reason.OTHER_FAMILY if large else None
         if reason is None:

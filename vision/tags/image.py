@@ -21,8 +21,8 @@ from .edge import INTERPOLATION, MODULES, Edges, Light, find_edges
 from .settings import EdgeSettings
 from .settings import TagSettings as _Settings
 
-_BEFORE = np.array([3, 0, 1, 2])  # edges before each edge
-_EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
+_PREVIOUS_EDGE = np.array([3, 0, 1, 2])  # edges before each edge
+_NO_GRADIENT = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,46 +53,46 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
 
 
 def _measured(
-    grey: ImageArray, id: int, corners_px: FloatArray, shorter: float, config: TagConfig
+    grey: ImageArray, id: int, corners_px: FloatArray, length_share: float, config: TagConfig
 ) -> TagImage | Reason:
-    """Measure the tag with shorter lines across its edges, by the factor `shorter`."""
+    """Measure the tag with shorter lines across its edges, by the factor `length_share`."""
     blur_px = _Settings.usual_blur_px
     light: Light | None = None
-    number, before_px = 0, math.inf
+    number, previous_px = 0, math.inf
     while True:
-        edges = find_edges(grey, corners_px, blur_px, light, shorter)
+        edges = find_edges(grey, corners_px, blur_px, light, length_share)
         if isinstance(edges, Reason):
             return edges
         number += 1
-        moved = _meetings(edges)
+        moved = _intersections(edges)
         moved_px = float(np.abs(moved - corners_px).max())
         module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
         if moved_px > max(EdgeSettings.longest_reach_px, module_px):
             return Reason.OCCLUDED
         corners_px, blur_px = moved, _blur(edges, blur_px)
         if light is None:
-            before_px = moved_px
-            light = _EVEN if moved_px < _Settings.rough_share * module_px or number >= _Settings.rounds else None
+            previous_px = moved_px
+            light = _NO_GRADIENT if moved_px < _Settings.rough_share * module_px or number >= _Settings.rounds else None
             continue
         light = _light(edges)
         # Each round moves the corners less, by about the same factor.
-        if min(moved_px, moved_px * moved_px / before_px) < _Settings.settled_px or number >= 2 * _Settings.rounds:
+        if min(moved_px, moved_px * moved_px / previous_px) < _Settings.settled_px or number >= 2 * _Settings.rounds:
             break
-        before_px = moved_px
+        previous_px = moved_px
     shortest_px = 2.0 * float(edges.half_lengths.min())
-    if shortest_px < _Settings.least_side_px:
+    if shortest_px < _Settings.min_side_px:
         return Reason.NO_MARKER
     bled_px, bled_var = bleed(grey, corners_px, blur_px, tag_modules(config.dictionary, id))
-    edges = replace(edges, places=edges.places + bled_px)
+    edges = replace(edges, offsets=edges.offsets + bled_px)
     cov_px = _corner_covariance(edges, bled_var)
-    if math.sqrt(float(np.diag(cov_px).max())) > _Settings.most_corner_sigma * shortest_px:
-        return Reason.BLURRED if blur_px * MODULES > _Settings.most_blur * shortest_px else Reason.NOT_STRAIGHT
-    return TagImage(id, _meetings(edges), cov_px)
+    if math.sqrt(float(np.diag(cov_px).max())) > _Settings.max_corner_sigma * shortest_px:
+        return Reason.BLURRED if blur_px * MODULES > _Settings.max_blur * shortest_px else Reason.NOT_STRAIGHT
+    return TagImage(id, _intersections(edges), cov_px)
 
 
-def _blur(edges: Edges, before_px: float) -> float:
-    """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`."""
-    return max(before_px + edges.widening / edges.information, EdgeSettings.sharpest_px)
+def _blur(edges: Edges, previous_px: float) -> float:
+    """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `previous_px`."""
+    return max(previous_px + edges.widening / edges.information, EdgeSettings.sharpest_px)
 
 
 def _light(edges: Edges) -> Light:
@@ -101,12 +101,12 @@ def _light(edges: Edges) -> Light:
     design = spots - spots.mean(axis=0)
     inverse = np.linalg.inv(design.T @ design)
     gradients = inverse @ design.T @ levels
-    left = levels - levels.mean(axis=0) - design @ gradients
-    variance = np.square(left).sum(axis=0) / (len(spots) - 3)
+    residuals = levels - levels.mean(axis=0) - design @ gradients
+    variance = np.square(residuals).sum(axis=0) / (len(spots) - 3)
     return Light(np.asarray(gradients.T, np.float64), variance[:, None, None] * inverse)
 
 
-def _likeness(edges: Edges) -> FloatArray:
+def _variance_ratios(edges: Edges) -> FloatArray:
     """Return the variances (2,) of an edge's place and slope relative to those for independent points.
 
     Interpolation and blur spread a pixel's noise to its neighbours, and neither a print nor a lens is straight. So slow
@@ -117,21 +117,21 @@ def _likeness(edges: Edges) -> FloatArray:
     power = np.concatenate([np.square(w @ points) for w, points in zip(waves, edges.residuals, strict=True)])
     index = np.concatenate([np.arange(2.0, 2.0 + len(w)) for w in waves])
     # The prior counts as waves too quick to show a random walk.
-    apart = np.linalg.norm(edges.spots[:, 1] - edges.spots[:, 0], axis=1) / [len(r) - 1 for r in edges.residuals]
+    spacing = np.linalg.norm(edges.spots[:, 1] - edges.spots[:, 0], axis=1) / [len(r) - 1 for r in edges.residuals]
     # White noise, smoothed as by a Gaussian of interpolation's variance; distant points are independent.
-    smoothed = max(math.sqrt(4.0 * math.pi * INTERPOLATION) * float(np.mean(1.0 / apart)), 1.0)
+    smoothed = max(math.sqrt(4.0 * math.pi * INTERPOLATION) * float(np.mean(1.0 / spacing)), 1.0)
     power = np.append(power, smoothed)
     design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
     count = np.append(np.ones_like(index), _Settings.smoothed_waves)
-    even = np.append(index**-1.0, 1.0) * count
-    alone = float(even @ power / even.sum())
+    weights = np.append(index**-1.0, 1.0) * count
+    white_noise = float(weights @ power / weights.sum())
     cov = np.linalg.inv(design * count @ design.T)
     level = cov @ (design * count) @ power
-    noise, steep = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
+    noise, walk_power = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
     chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, smoothed)
     # Walks within chance are ignored, larger ones are shrunk a little (James and Stein).
-    walk = steep * max(1.0 - (_Settings.chance * chance / steep) ** 2, 0.0)
-    return (noise if walk else alone) + walk * np.array([4.0, 1.0])
+    walk = walk_power * max(1.0 - (_Settings.chance * chance / walk_power) ** 2, 0.0)
+    return (noise if walk else white_noise) + walk * np.array([4.0, 1.0])
 
 
 @lru_cache
@@ -142,32 +142,34 @@ def _slow_waves(count: int) -> FloatArray:
     return frozen_array(math.sqrt(2.0 / count) * np.cos(angles))
 
 
-def _meetings(edges: Edges) -> FloatArray:
+def _intersections(edges: Edges) -> FloatArray:
     """Return the intersections (4, 2) [px] of each edge's line with that of the edge before it."""
     points, directions = edges.points, edges.directions
-    before, across = directions[_BEFORE], points - points[_BEFORE]
+    previous, across = directions[_PREVIOUS_EDGE], points - points[_PREVIOUS_EDGE]
     # Cramer's rule
     steps = across[:, 0] * directions[:, 1] - across[:, 1] * directions[:, 0]
-    steps /= before[:, 0] * directions[:, 1] - before[:, 1] * directions[:, 0]
-    return points[_BEFORE] + steps[:, None] * before
+    steps /= previous[:, 0] * directions[:, 1] - previous[:, 1] * directions[:, 0]
+    return points[_PREVIOUS_EDGE] + steps[:, None] * previous
 
 
-def _corner_covariance(edges: Edges, together: float) -> FloatArray:
+def _corner_covariance(edges: Edges, common_var: float) -> FloatArray:
     """Return the covariance (8, 8) of the corners; each lies on the edge before it and on its own edge.
 
     A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂. dp is the shift of the line at
-    the corner: that of its place, plus that of its slope times s. `together` is the variance [px²] of the shift of all
-    edges.
+    the corner: that of its place, plus that of its slope times s. `common_var` is the variance [px²] of the shift of
+    all edges.
     """
     directions = edges.directions / np.linalg.norm(edges.directions, axis=1)[:, None]
     normals = np.column_stack([directions[:, 1], -directions[:, 0]])
     by_edge = np.zeros((4, 2, 4, 2))
     cov = np.zeros((4, 2, 4, 2))
-    cov[:, 0, :, 0] = together
-    cov[range(4), :, range(4)] += np.sqrt(np.multiply.outer(*[_likeness(edges)] * 2)) * edges.scatter + edges.shared
-    solve = np.linalg.inv(np.stack([normals[_BEFORE], normals], axis=1))
+    cov[:, 0, :, 0] = common_var
+    cov[range(4), :, range(4)] += (
+        np.sqrt(np.multiply.outer(*[_variance_ratios(edges)] * 2)) * edges.scatter + edges.shared
+    )
+    solve = np.linalg.inv(np.stack([normals[_PREVIOUS_EDGE], normals], axis=1))
     # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
-    by_edge[range(4), :, _BEFORE] = solve[:, :, :1] * (1.0, 1.0)
+    by_edge[range(4), :, _PREVIOUS_EDGE] = solve[:, :, :1] * (1.0, 1.0)
     by_edge[range(4), :, range(4)] = solve[:, :, 1:] * (1.0, -1.0)
     rows = by_edge.reshape(8, 8)
     return rows @ cov.reshape(8, 8) @ rows.T

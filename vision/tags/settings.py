@@ -12,8 +12,8 @@ class EdgeSettings:
     `sharpest_px` at 3 times.
     """
 
-    least_contrast = 20.0  # difference of white and black [grey levels]
-    least_visible = 0.7  # share of each edge that has to be on a line
+    min_contrast = 20.0  # difference of white and black [grey levels]
+    min_visible = 0.7  # share of each edge that has to be on a line
     # Distance in blurs that lines across an edge keep from the ends of black border and white margin (one module each),
     # so that little of the modules beyond shows; on small tags they reach over this share of the module. Their distance
     # in blurs from the tag's corners, which are rounded off: at 1.8 without noise tags come out larger by 0.0004 px an
@@ -21,7 +21,7 @@ class EdgeSettings:
     clear_blurs, clear_share, corner_blurs = 1.7, 0.5, 2.6
     longest_reach_px = 6.0
     sample_px = 0.5
-    fewest_points, most_points = 6, 80
+    min_points, max_points = 6, 80
     sharpest_px = 0.45  # edge (1-sigma)
     beyond_share = 0.2  # relative error of the correction for the modules beyond: no lens blurs exactly like a Gaussian
     # Least error of an edge [px]: images without noise leave 0.0004 to 0.0007, as levels are whole numbers. Noise
@@ -44,19 +44,19 @@ class TagSettings:
     Sensitivity, as above: all outcomes stay, half of the positions move by less than 0.3 sigma and half of the sigmas
     change by less than 5 %. What matters: `apart_share` at 0.3 times (3 outcomes), `rounds` at 1 (0.4 sigma), `chance`
     at 0.3 times (sigma + 32 %). The numbers of search and pose change nothing there. Of the limits, in 189 frames:
-    `least_side_px` at 3 times (47 outcomes) and `most_reprojection` at 0.3 times (12); the others change none.
+    `min_side_px` at 3 times (47 outcomes) and `max_reprojection` at 0.3 times (12); the others change none.
     """
 
-    least_side_px = 16.0  # a shorter side is too small to be measured
-    most_corner_sigma = 0.05  # 1-sigma of a corner, as a share of the side: edges that are not straight have more
+    min_side_px = 16.0  # a shorter side is too small to be measured
+    max_corner_sigma = 0.05  # 1-sigma of a corner, as a share of the side: edges that are not straight have more
     epipolar_px, epipolar_sigmas = 0.5, 4.0  # largest difference of the eyes' rows [px], on top of so many sigmas
     size_tolerance = 0.03  # largest part by which the printed size may contradict the stereo depth, besides noise
-    most_reprojection = 4.0  # largest misfit of the corners to the marker's shape (RMS, in their own sigmas)
+    max_reprojection = 4.0  # largest misfit of the corners to the marker's shape (RMS, in their own sigmas)
     # Most rounds with rough corners, and half of all; converged when no corner would move by more than this [px].
     rounds, settled_px = 4, 0.003
     rough_share = 0.3  # corners are rough until they move by less than this share of a module
     usual_blur_px = 0.85  # usual blur of lens and interpolation (1-sigma) [px]
-    most_blur = 0.5  # a blur that is a larger share of a module is the cause where corners are not sure
+    max_blur = 0.5  # a blur that is a larger share of a module is the cause where corners are not sure
     smoothed_waves = 10  # weight in waves along the edges of the power that interpolation alone gives them
     slow = 4  # slow waves have half-periods of at least this many points, and this least upper bound of their indices
     chance = 2.5  # standard deviations of chance that a random walk along the edges has to exceed

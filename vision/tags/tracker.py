@@ -22,7 +22,7 @@ from bodyschema.interfaces.records import (
 )
 from bodyschema.vision.config import LONGEST_PAUSE_S
 from bodyschema.vision.image_checks import check_calibration, check_images
-from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, first_pose, fitted_motion, mirrored
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, fitted_motion, initial_poses, mirrored
 from bodyschema.vision.triangulate import triangulate
 
 from .body import TagBody, bends
@@ -35,7 +35,7 @@ from .settings import TagSettings as _Settings
 _log = logging.getLogger(__name__)
 
 # Reasons, the most informative first, for a frame in which all tags were rejected.
-_TELLING = (
+_REASON_PRIORITY = (
     Reason.AMBIGUOUS,
     Reason.EPIPOLAR,
     Reason.OCCLUDED,
@@ -82,9 +82,9 @@ class TagTracker:
         self._is_known, self._readout_s, self._t_sigma = not readout_sigma_s, readout_s or readout_sigma_s, 0.0
         self._last: tuple[float, list[dict[int, FloatArray]], FloatArray] | None = None
         self._seen: tuple[float, list[dict[int, FloatArray]]] = -math.inf, []  # with refused frames
-        self._before = self._seen
+        self._previous = self._seen
         self._planes: dict[frozenset[int], tuple[FloatArray, FloatArray]] = {}
-        self._met = False  # a marker found before is neither mirrored nor of another dictionary
+        self._was_found = False  # a marker found before is neither mirrored nor of another dictionary
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
@@ -93,15 +93,15 @@ class TagTracker:
             SourceError: the images are not uint8 BGR of the calibration's size.
         """
         check_images(frame, self.calibration)
-        self._before = self._seen
+        self._previous = self._seen
         greys = [np.asarray(cv2.cvtColor(eye, cv2.COLOR_BGR2GRAY), np.uint8) for eye in frame.images]
         found: Pose | Reason = Reason.NO_MARKER
         regions = self._predicted(frame.t)
         if regions is not None:
-            found = self._look(frame.t, greys, regions)
+            found = self._search(frame.t, greys, regions)
         if not isinstance(found, Pose):
-            found = self._look(frame.t, greys, [self._whole] * len(greys))
-        if found is Reason.NO_MARKER and not self._met:
+            found = self._search(frame.t, greys, [self._whole] * len(greys))
+        if found is Reason.NO_MARKER and not self._was_found:
             found = self._finder.suspicion(greys[0]) or found
         if isinstance(found, Reason):
             if self._last is not None:
@@ -121,27 +121,27 @@ class TagTracker:
         turn = frozen_array(_quaternion(pose.rotation))
         return MarkerFix(t, frozen_array(pose.x), cov, centres, self._t_sigma, R=turn, cov_R=cov_R)
 
-    def _look(
+    def _search(
         self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
     ) -> Pose | Reason:
         found = [self._finder.find(grey, region) for grey, region in zip(greys, regions, strict=True)]
         seen = [{id: tag for id, tag in eye.items() if isinstance(tag, TagImage)} for eye in found]
         if not all(seen):
-            return _why(eye for eye, tags in zip(found, seen, strict=True) if not tags)
+            return _best_reason(eye for eye, tags in zip(found, seen, strict=True) if not tags)
         if len(seen) > 1:
             if seen[0].keys().isdisjoint(seen[1]):
-                return _why(found)
-            seen = self._agreeing(*seen)
+                return _best_reason(found)
+            seen = self._consistent_tags(*seen)
             if isinstance(seen, Reason):
                 return seen
         corners = [{id: tag.corners_px for id, tag in eye.items()} for eye in seen]
         self._seen = t, corners
-        pose = self._pose(t, self._at_one_time(t, seen) if self._readout_s else seen)
+        pose = self._pose(t, self._readout_corrected(t, seen) if self._readout_s else seen)
         if isinstance(pose, Pose):
-            self._last, self._met = (t, corners, pose.rotation), True
+            self._last, self._was_found = (t, corners, pose.rotation), True
         return pose
 
-    def _at_one_time(self, t: float, seen: list[dict[int, TagImage]]) -> list[dict[int, TagImage]]:
+    def _readout_corrected(self, t: float, seen: list[dict[int, TagImage]]) -> list[dict[int, TagImage]]:
         """Return the tags with their corners at the time when the rolling shutter read the marker's middle row.
 
         Each corner is assumed to move as since the last frame. New tags are not moved, and the time is uncertain. If
@@ -149,56 +149,58 @@ class TagTracker:
         """
         row_s = self._readout_s / self.calibration.image_size_px[1]
         middle = np.mean([tag.corners_px[:, 1].mean() for eye in seen for tag in eye.values()])
-        last_t, last = self._before
+        last_t, last = self._previous
         if not 0 < t - last_t <= LONGEST_PAUSE_S:
             last = []
         moved, self._t_sigma = [], 0.0
-        for eye, before in zip(seen, last or [{}] * len(seen), strict=True):
+        for eye, previous in zip(seen, last or [{}] * len(seen), strict=True):
             tags = dict(eye)
-            if eye.keys() - before.keys():
+            if eye.keys() - previous.keys():
                 self._t_sigma = self._readout_s
-            for id in eye.keys() & before.keys():
+            for id in eye.keys() & previous.keys():
                 px = eye[id].corners_px
-                since_s = t - last_t + row_s * (px[:, 1:] - before[id][:, 1:])
+                since_s = t - last_t + row_s * (px[:, 1:] - previous[id][:, 1:])
                 late_s = row_s * (px[:, 1:] - middle)
-                skew_px = late_s * (px - before[id]) / since_s
+                skew_px = late_s * (px - previous[id]) / since_s
                 tags[id] = (
                     replace(eye[id], corners_px=px - skew_px) if self._is_known else replace(eye[id], skew_px=skew_px)
                 )
             moved.append(tags)
         return moved
 
-    def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
+    def _consistent_tags(
+        self, left: dict[int, TagImage], right: dict[int, TagImage]
+    ) -> list[dict[int, TagImage]] | Reason:
         """Return both eyes' tags, some of them common, without those whose rows differ."""
         both = left.keys() & right.keys()
-        apart = {id for id in both if not self._rows_agree(left[id], right[id])}
-        if apart.issuperset(both):
+        mismatched = {id for id in both if not self._rows_agree(left[id], right[id])}
+        if mismatched.issuperset(both):
             return Reason.EPIPOLAR
-        return [{id: tag for id, tag in eye.items() if id not in apart} for eye in (left, right)]
+        return [{id: tag for id, tag in eye.items() if id not in mismatched} for eye in (left, right)]
 
     def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
         """Return True if the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
-        apart = left.corners_px - right.corners_px
+        disparity = left.corners_px - right.corners_px
         rows = np.arange(1, len(left.cov_px), 2)
         cov = (left.cov_px + right.cov_px)[np.ix_(rows, rows)]
         sigma = math.sqrt(float(cov.mean()) + 2.0 * self.calibration.pixel_sigma**2)
         allowed = _Settings.epipolar_px + _Settings.epipolar_sigmas * sigma
-        return abs(float(apart[:, 1].mean())) <= allowed and bool((apart[:, 0] > 0.0).all())
+        return abs(float(disparity[:, 1].mean())) <= allowed and bool((disparity[:, 0] > 0.0).all())
 
     def _pose(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
         """Return the one likely pose; a tag that contradicts the others is left out once."""
-        found = self._likely(t, seen)
+        found = self._most_likely_pose(t, seen)
         if isinstance(found, Pose) or found is not Reason.REPROJECTION or len(_ids(seen)) < 3:
             return found
         outcomes = []
         for id in sorted(_ids(seen)):
             others = [{key: tag for key, tag in eye.items() if key != id} for eye in seen]
             if others[0].keys() & others[-1].keys():
-                outcomes.append(self._likely(t, others))
+                outcomes.append(self._most_likely_pose(t, others))
         poses = [outcome for outcome in outcomes if isinstance(outcome, Pose)]
         return min(poses, key=lambda pose: pose.squares) if poses else found
 
-    def _likely(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
+    def _most_likely_pose(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
         sightings = [
             Sighting(self.body.corners[id], tag.corners_px, tag.cov_px, bool(eye), tag.skew_px)
             for eye, tags in enumerate(seen)
@@ -210,27 +212,29 @@ class TagTracker:
             return Reason.EPIPOLAR if self.calibration.is_stereo else Reason.REPROJECTION
         best = poses[0]
         freedom = sum(sighting.pixels.size for sighting in sightings) - 6
-        misfit, most = best.squares / freedom, _Settings.most_reprojection**2
+        chi2_per_freedom, limit = best.squares / freedom, _Settings.max_reprojection**2
         if self.calibration.is_stereo:
-            grown, sigma = estimator.scale(best)
-            by_size = misfit > most and grown**2 > 0.5 * best.squares * sigma**2  # the larger part of the misfit
-            if by_size or abs(grown) > _Settings.size_tolerance + 4.0 * sigma:
+            size_error, sigma = estimator.size_error(best)
+            by_size = (
+                chi2_per_freedom > limit and size_error**2 > 0.5 * best.squares * sigma**2
+            )  # the larger part of the misfit
+            if by_size or abs(size_error) > _Settings.size_tolerance + 4.0 * sigma:
                 return Reason.SIZE_MISMATCH
-        if misfit > most:
+        if chi2_per_freedom > limit:
             return Reason.REPROJECTION
-        if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _Settings.clearly_worse:
-            stayed = self._stayed(t, poses[:2])
-            if stayed is None:
+        if len(poses) > 1 and (poses[1].squares - best.squares) / max(chi2_per_freedom, 1.0) < _Settings.clearly_worse:
+            consistent = self._consistent_pose(t, poses[:2])
+            if consistent is None:
                 return Reason.AMBIGUOUS
-            best = stayed
+            best = consistent
         # The part of the misfit beyond the claimed noise and chance (2-sigma) is treated as more noise.
-        unexplained = max(misfit - 2.0 * math.sqrt(2.0 / freedom), 1.0)
+        unexplained = max(chi2_per_freedom - 2.0 * math.sqrt(2.0 / freedom), 1.0)
         return Pose(best.rotation, best.x, best.cov * unexplained, best.squares)
 
     def _minima(self, estimator: PoseEstimator, seen: list[dict[int, TagImage]]) -> list[Pose]:
         """Return the distinct local minima of the squares, the most likely first."""
         poses: list[Pose] = []
-        for rotation, x in self._starts(seen):
+        for rotation, x in self._initial_poses(seen):
             for turn in (rotation, self._mirrored(rotation, x, seen)):
                 pose = estimator.refine(turn, x)
                 if pose is not None and self._bends is not None:
@@ -241,21 +245,21 @@ class TagTracker:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.squares)
 
-    def _stayed(self, t: float, poses: Sequence[Pose]) -> Pose | None:
+    def _consistent_pose(self, t: float, poses: Sequence[Pose]) -> Pose | None:
         """Return the pose, of two, that is consistent with the last frame; None if that is unclear."""
         if self._last is None or not 0 < t - self._last[0] <= LONGEST_PAUSE_S:
             return None
         turned = [angle_between(self._last[2], pose.rotation) for pose in poses]
         nearest = int(np.argmin(turned))
-        apart = angle_between(poses[0].rotation, poses[1].rotation)
-        return poses[nearest] if turned[nearest] < _Settings.stayed * apart else None
+        separation = angle_between(poses[0].rotation, poses[1].rotation)
+        return poses[nearest] if turned[nearest] < _Settings.stayed * separation else None
 
-    def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
+    def _initial_poses(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
         """Return initial poses from the corners that all eyes see."""
         if not self.calibration.is_stereo:
             ids = list(seen[0])
             corners = np.concatenate([self.body.corners[id] for id in ids])
-            return first_pose(self.calibration, corners, np.concatenate([seen[0][id].corners_px for id in ids]))
+            return initial_poses(self.calibration, corners, np.concatenate([seen[0][id].corners_px for id in ids]))
         body, points = [], []
         for id in sorted(seen[0].keys() & seen[1].keys()):
             pixels = np.hstack([seen[0][id].corners_px, seen[1][id].corners_px])
@@ -300,10 +304,10 @@ def _ids(seen: Iterable[dict[int, TagImage]]) -> set[int]:
     return set[int]().union(*seen)
 
 
-def _why(eyes: Iterable[Seen]) -> Reason:
+def _best_reason(eyes: Iterable[Seen]) -> Reason:
     """Return the most informative reason why tags were not measured; NO_MARKER if none was found."""
     reasons = {tag for eye in eyes for tag in eye.values() if isinstance(tag, Reason)}
-    return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
+    return next((reason for reason in _REASON_PRIORITY if reason in reasons), Reason.NO_MARKER)
 
 
 def _quaternion(rotation: FloatArray) -> FloatArray:

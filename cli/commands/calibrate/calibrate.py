@@ -86,7 +86,7 @@ class FitOptions:
         Args:
             common: returns the errors that all positions share, as for `Calibration.of`; None if none are known.
         """
-        from bodyschema.calibration.rigid_chain import Calibration, fewest_pairs
+        from bodyschema.calibration.rigid_chain import Calibration, min_pairs
 
         def of(trusted: Trusted) -> Calibration:
             zeros_rad = math.radians(self.zeros_deg)
@@ -95,7 +95,7 @@ class FitOptions:
             )
 
         trusted = self.trusted()
-        enough = len(recording) >= fewest_pairs(len(robot.joints), "nothing")
+        enough = len(recording) >= min_pairs(len(robot.joints), "nothing")
         return of(trusted), of("nothing") if trusted != "nothing" and enough else None
 
 
@@ -220,7 +220,7 @@ def arm(
     found, report = rows.calibrated(fit, common, camera_frame, force=force)
     if out is not None or servos.write:
         _require_writable(report, force=force)
-    told = [] if out is None else _written(config, found, report, out, replace=force)
+    written_lines = [] if out is None else _written(config, found, report, out, replace=force)
     of_cameras, lines = [*unknown, *_contained(found)], plan.written(found)
     offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
     changed = servos.lines(config, offsets, rows.source)
@@ -228,7 +228,7 @@ def arm(
         print_json(report)
         sys.stderr.writelines(f"{line}\n" for line in [*of_cameras, *changed])
     else:
-        _show(report, [*of_cameras, *lines, *changed], told)
+        _show(report, [*of_cameras, *lines, *changed], written_lines)
 
 
 @dataclass(frozen=True)
@@ -272,12 +272,12 @@ class _Rows:
 
     def _checked(self, sigma_m: float | None) -> Plausibility:
         """Check that the recording can be of this robot; refuse units that no arm has."""
-        from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+        from bodyschema.calibration.plausibility.check import plausibility, recorded_sigma
         from bodyschema.calibration.plausibility.limits import require_units
 
         rows = self.recording
         require_units(self.robot, rows, self.source)
-        sigma_m = told_sigma(rows) or sigma_m
+        sigma_m = recorded_sigma(rows) or sigma_m
         return plausibility(self.robot, rows.q, rows.x, t=rows.t, sigma_m=sigma_m, orientation=rows.orientation)
 
 

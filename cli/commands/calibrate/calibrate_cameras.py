@@ -118,7 +118,7 @@ def cameras(
     Next: open the report; `bodyschema calibrate cameras --check` whenever a camera may have been touched.
     """
     if instead.print_board:
-        _print_board(printed.drawn(), instead.paper, out or BOARD)
+        _print_board(printed.nominal_board(), instead.paper, out or BOARD)
     elif instead.check:
         _check(images, files, printed, robot, instead, as_json=as_json)
     else:
@@ -157,11 +157,11 @@ def _calibrate(
         out, named = out or calibration_file(config), require_cameras(config).calibration is not None
     report = write_calibrated_cameras(result, found, out)
     measured = printed.ruler_mm is not None or known.baseline_mm is not None
-    told = figures(result, found, size_was_measured=measured, autofocus=autofocus)
+    summary = figures(result, found, size_was_measured=measured, autofocus=autofocus)
     if as_json:
-        print_json(told)
+        print_json(summary)
         return
-    Console(highlight=False).print(cameras_view(told))
+    Console(highlight=False).print(cameras_view(summary))
     say(f"\n{out} written. Open {report}.")
     if not named:
         say(f'In [vision.cameras] write\ncalibration = "{out.name}"')

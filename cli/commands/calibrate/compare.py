@@ -73,24 +73,24 @@ def sentences(report: ComparisonReport) -> list[str]:
     from bodyschema.cli.terminal.screen import mm
 
     distances, left = report.distances, report.left_out
-    said = [
+    lines = [
         f"{report.second} is {mm(distances.mean_mm / 1e3)} from {report.first} on average, "
         f"{mm(distances.max_mm / 1e3)} at most, over {report.compared} rows of the same joint angles."
     ]
     if report.rows != report.other_rows:
-        said.append(
+        lines.append(
             f"{report.first} has {report.rows} rows, {report.second} {report.other_rows}: rows of the same joint "
             "angles were compared."
         )
     if left.first or left.second:
-        said.append(_not_compared(report, left))
+        lines.append(_not_compared(report, left))
     if report.aligned is not None:
         moved = mm(sum(part**2 for part in report.aligned.shift_mm) ** 0.5 / 1e3)
-        said.append(
+        lines.append(
             f"A turn of {report.aligned.turn_deg:.3g}° and a shift of {moved} as a whole leave "
             f"{mm(report.aligned.distances.mean_mm / 1e3)}."
         )
-    return said
+    return lines
 
 
 def _not_compared(report: ComparisonReport, left: LeftOut) -> str:

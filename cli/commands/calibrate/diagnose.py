@@ -72,10 +72,10 @@ def diagnose(
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
     servos.require(config)
-    asked = search.asked()
+    settings = search.settings()
     source = measured(config, recording, lambda file: opened(config, file, taken, servos.lerobot), live=live)
     with results_in(out), _progress(Console(stderr=True, highlight=False)) as tell:
-        found = run(config, source, asked, tell, force=force)
+        found = run(config, source, settings, tell, force=force)
         if out is not None:
             tell("writing the report")
             written(found, out)

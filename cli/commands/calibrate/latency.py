@@ -92,5 +92,5 @@ def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool
     known_s = 0.0 if sim or seen is None else seen.latency_s
     with open_sources(config, sim=sim) as sources, console.status("move the arm to and fro, unevenly") as status:
         seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
-    say(*filter(None, (*seen.health, seen.said)), stderr=True)
+    say(*filter(None, (*seen.health, seen.summary)), stderr=True)
     return seen.wiggle.with_stamps_later(known_s)  # as the camera sent them, before robot.toml's latency was subtracted

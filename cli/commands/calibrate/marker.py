@@ -17,7 +17,7 @@ from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Images
-    from bodyschema.daemon.wiring.markers import Wanted
+    from bodyschema.daemon.wiring.markers import TagSelection
 
 marker = cyclopts.App(
     name="marker",
@@ -94,16 +94,16 @@ def print_tags(
     from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, sheet, tables
 
     usual_mm, *usual = {"board": (20.0, 8, 5), "chessboard": (30.0, 8, 5)}.get(shape, (40.0, 2, 1))
-    drawn = Tags(shape, ids, family, side_mm or usual_mm, columns or usual[0], rows or usual[1], fold_deg)
-    across, upright = write_page(sheet(drawn, paper), out)
-    tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
+    nominal = Tags(shape, ids, family, side_mm or usual_mm, columns or usual[0], rows or usual[1], fold_deg)
+    across, upright = write_page(sheet(nominal, paper), out)
+    tags = nominal if ruler_mm is None else as_printed(nominal, across, ruler_mm)
     rulers = (
         f"each is {across:g} mm" if across == upright else f"{across:g} mm below the picture, {upright:g} mm beside it"
     )
-    said = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
-    if drawn.body is not None:
-        said += f" Each {'square' if shape == 'board' else 'face'} is {face_mm(tags):.1f} mm wide."
-    say(said, stderr=True)
+    message = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
+    if nominal.body is not None:
+        message += f" Each {'square' if shape == 'board' else 'face'} is {face_mm(tags):.1f} mm wide."
+    say(message, stderr=True)
     sys.stdout.write(tables(tags))
 
 
@@ -161,11 +161,11 @@ def learn(
         if auto or at is not None or len(images) != 1:
             raise RequestError("--side-mm measures a cluster: give one folder of images, and neither --at nor --auto")
         from bodyschema.cli.cameras.tag_pages import numbers_of
-        from bodyschema.daemon.wiring.markers import Wanted, sides_of
+        from bodyschema.daemon.wiring.markers import TagSelection, sides_of
 
         numbers = None if ids is None else tuple(numbers_of(ids))
-        wanted = Wanted(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
-        _measure_cluster(files.of(images[0]), calibration, wanted, as_json=as_json)
+        selection = TagSelection(family, 1e-3 * side_mm, numbers, sides_of(other_sides_mm) if other_sides_mm else {})
+        _measure_cluster(files.of(images[0]), calibration, selection, as_json=as_json)
         return
     if auto == (at is not None) or (not images and not auto):
         raise RequestError(
@@ -175,15 +175,15 @@ def learn(
     sys.stdout.write(learnt_colour_table(images, at) if images else _learnt_live(robot, seconds))
 
 
-def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_json: bool) -> None:
+def _measure_cluster(images: Images, calibration: Path, selection: TagSelection, *, as_json: bool) -> None:
     from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
-    found = measured(images, calibration, wanted, partial(say, stderr=True))
+    found = measured(images, calibration, selection, partial(say, stderr=True))
     if as_json:
         print_json(figures(found))
         return
     say(said(found), stderr=True)
-    sys.stdout.write(tables(found, wanted))
+    sys.stdout.write(tables(found, selection))
 
 
 def _learnt_live(robot: Path, seconds: float) -> str:

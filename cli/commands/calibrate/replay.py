@@ -65,7 +65,7 @@ def replay(
     Next: `bodyschema run` with the arm.
     """
     from bodyschema.calibration.evaluate import split_blocks
-    from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+    from bodyschema.calibration.plausibility.check import plausibility, recorded_sigma
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.replay.report import as_text
@@ -91,7 +91,7 @@ def replay(
         rows.x,
         t=rows.t,
         chain=chain,
-        sigma_m=told_sigma(rows) or sigma_m,
+        sigma_m=recorded_sigma(rows) or sigma_m,
         orientation=rows.orientation,
     )
     warnings = seen.require(recording, force=force)

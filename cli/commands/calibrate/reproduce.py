@@ -15,7 +15,7 @@ from rich.console import Console
 from bodyschema.cli.commands.options import flag
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.extras import require_extra
-from bodyschema.interfaces.whole_files import writing
+from bodyschema.interfaces.whole_files import raising_write_errors
 
 Name = Literal["fig4", "fig5", "fig6", "fig7", "exactness", "all"]
 
@@ -56,12 +56,12 @@ def reproduce(
         raise ConfigError(f"--seed is {seed}", remedy="Give 0 or more")
     if real and name in ("fig5", "fig7", "all"):
         require_extra("sim", "a measured curve (--no-real leaves it out)")
-    with writing(out, what="made", remedy="Give another --out"):
+    with raising_write_errors(out, what="made", remedy="Give another --out"):
         out.mkdir(parents=True, exist_ok=True)
     done = list(_experiments(name, out, seed, real=real, quiet=as_json))
     if as_json:
-        told = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
-        sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
+        result = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}
+        sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
 
 
 def _experiments(name: Name, out: Path, seed: int, *, real: bool, quiet: bool) -> Iterator[dict[str, object]]:

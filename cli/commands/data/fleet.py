@@ -18,7 +18,7 @@ from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.waits import Waits
 
 if TYPE_CHECKING:
-    from bodyschema.cli.recordings.diagnosis import Asked
+    from bodyschema.cli.recordings.diagnosis import DiagnosisSettings
     from bodyschema.fleet.diagnosing import Job
     from bodyschema.fleet.roster import Place
 
@@ -82,8 +82,8 @@ def fleet(
         from bodyschema.interfaces.extras import require_extra
 
         require_extra("fleet", "diagnosing many recordings")
-        wanted = jobs(recordings, folder, robot[0] if robot else None)
-        _diagnose(wanted, search.asked(), out, scheduler, workers, as_json=as_json)
+        pending = jobs(recordings, folder, robot[0] if robot else None)
+        _diagnose(pending, search.settings(), out, scheduler, workers, as_json=as_json)
     elif any(given is not None for given in (out, scheduler, search.effects, search.exclude)):
         raise RequestError("--out, --scheduler, --effects and --exclude go with recordings; give some, or --from")
     elif compare:
@@ -92,38 +92,38 @@ def fleet(
         _list(_places(connect, robot), watch=watch, json=as_json)
 
 
-def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
+def _list(given_paths: list[Place], *, watch: bool, json: bool) -> None:
     from bodyschema.fleet.roster import Fleet, as_json, screen
 
     console = Console(highlight=False)
-    with Fleet(looked_at) as robots:
+    with Fleet(given_paths) as robots:
         if watch and not json:
             with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
                 while True:
-                    live.update(screen(robots.look(), robots.unreached), refresh=True)
+                    live.update(screen(robots.poll(), robots.unreachable), refresh=True)
                     time.sleep(Waits.status_every_s)
         while True:
-            members = robots.look()
+            members = robots.poll()
             if json:
                 console.file.write(as_json(members) + "\n")
                 console.file.flush()
             elif members:
-                console.print(screen(members, robots.unreached))
+                console.print(screen(members, robots.unreachable))
             if not watch:
                 break
             time.sleep(Waits.status_every_s)
     if not any(member.alive for member in members):
-        _nobody(looked_at)
+        _nobody(given_paths)
 
 
-def _compare(looked_at: list[Place], *, as_json: bool) -> None:
+def _compare(given_paths: list[Place], *, as_json: bool) -> None:
     from bodyschema.fleet.comparison import compare_types, view
     from bodyschema.fleet.roster import Fleet
 
-    with Fleet(looked_at) as robots:
-        members = robots.look()
+    with Fleet(given_paths) as robots:
+        members = robots.poll()
         if not any(member.alive for member in members):
-            _nobody(looked_at)
+            _nobody(given_paths)
         found, left_out = compare_types(robots, members)
     if not found:
         raise RequestError(f"nothing to compare. {'; '.join(left_out)}")
@@ -134,17 +134,23 @@ def _compare(looked_at: list[Place], *, as_json: bool) -> None:
 
 
 def _diagnose(
-    wanted: list[Job], asked: Asked, out: Path | None, scheduler: str | None, workers: int | None, *, as_json: bool
+    pending: list[Job],
+    settings: DiagnosisSettings,
+    out: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+    *,
+    as_json: bool,
 ) -> None:
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster
     from bodyschema.fleet.summary import progress, summary, view
 
     with (
-        progress(Console(stderr=True, highlight=False), len(wanted)) as (told, done),
-        cluster(scheduler, len(wanted), workers) as client,
+        progress(Console(stderr=True, highlight=False), len(pending)) as (tell, done),
+        cluster(scheduler, len(pending), workers) as client,
     ):
-        results = diagnose_all(wanted, asked, out, client, told, done)
+        results = diagnose_all(pending, settings, out, client, tell, done)
     found = summary(results)
     if as_json:
         print_json(found)

@@ -42,11 +42,11 @@ def record(
     with client(config.route("sampler")) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
-            wishes = SignalFlags()
-            with on_termination(wishes.end):
+            signals = SignalFlags()
+            with on_termination(signals.end):
                 if not as_json:
                     say(f"writing pairs to {out} as they come; Ctrl-C ends it")
-                count = follow_history(history, config.robot, out, lambda: wishes.ending)
+                count = follow_history(history, config.robot, out, lambda: signals.ending)
         else:
             count = copy_history(history, config.robot, out)
     if as_json:

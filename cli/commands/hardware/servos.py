@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from bodyschema.cli.servos.changes import Planned
     from bodyschema.cli.servos.log import ServoLog
-    from bodyschema.daemon.wiring.eeprom import EepromEditor, Wanted
+    from bodyschema.daemon.wiring.eeprom import EepromEditor, SelectedServo
 
 RATE = 1_000_000
 
@@ -77,27 +77,27 @@ def servos(
     if zero:
         _zero(robot, joint, in_servo=in_servo, dry_run=dry_run, yes=yes)
         return
-    wishes = assignments(settings)
-    if wishes and not (joint or bus or port):
+    assigned = assignments(settings)
+    if assigned and not (joint or bus or port):
         raise ConfigError("no servos are named", remedy="Name them with --joint, --bus, or --port and --id")
-    wanted = _wanted(robot, joint, bus, port, id, baud)
-    if wishes:
+    selected = _selected_servos(robot, joint, bus, port, id, baud)
+    if assigned:
         log = _log(robot, port)
-        with _workbench(wanted) as workbench:
-            _carry_out(workbench, plan(workbench, wanted, wishes), log, dry_run=dry_run, yes=yes)
+        with _workbench(selected) as workbench:
+            _carry_out(workbench, plan(workbench, selected, assigned), log, dry_run=dry_run, yes=yes)
     else:
-        _show(wanted, as_json=as_json)
+        _show(selected, as_json=as_json)
 
 
-def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
+def _show(selected: Sequence[SelectedServo], *, as_json: bool) -> None:
     from bodyschema.cli.servos.changes import settings_json, settings_table
     from bodyschema.daemon.wiring.eeprom import settings_by_name
 
     found = []
-    with _workbench(wanted) as workbench:
-        for one in wanted:
+    with _workbench(selected) as workbench:
+        for one in selected:
             at = workbench.bus(one.port, one.baud)
-            servo = workbench.fitted(at, one.entry, one.model)
+            servo = workbench.identified_servo(at, one.entry, one.model)
             settings = settings_by_name(workbench, one.model).values()
             found.append((servo, [(setting, workbench.value(at, servo, setting)) for setting in settings]))
             if not as_json:
@@ -111,12 +111,12 @@ def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool,
 
     if not joint:
         raise ConfigError("no joint is named", remedy="Name it with --joint")
-    wanted = _wanted(robot, joint, None, None, None, RATE)
-    with _workbench(wanted) as workbench:
+    selected = _selected_servos(robot, joint, None, None, None, RATE)
+    with _workbench(selected) as workbench:
         if in_servo:
-            _carry_out(workbench, plan_zeros(workbench, wanted), _log(robot, None), dry_run=dry_run, yes=yes)
+            _carry_out(workbench, plan_zeros(workbench, selected), _log(robot, None), dry_run=dry_run, yes=yes)
             return
-        say(*zero_lines(zero_ticks(workbench, wanted)))
+        say(*zero_lines(zero_ticks(workbench, selected)))
         say(f"Put it into the entry of the joint in {robot}. Nothing was written.")
 
 
@@ -136,9 +136,9 @@ def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
         _carry_out(workbench, planned, log, dry_run=dry_run, yes=yes, undoes=entries[0].batch)
 
 
-def _wanted(
+def _selected_servos(
     robot: Path, joints: Sequence[str], bus: str | None, port: str | None, id: int | None, baud: int
-) -> list[Wanted]:
+) -> list[SelectedServo]:
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.eeprom import configured, stranger
 
@@ -151,10 +151,10 @@ def _wanted(
     return [stranger(port, baud, id)]
 
 
-def _workbench(wanted: Sequence[Wanted]) -> EepromEditor:
+def _workbench(selected: Sequence[SelectedServo]) -> EepromEditor:
     from bodyschema.daemon.wiring.eeprom import workbench_of
 
-    return workbench_of(wanted[0].table)
+    return workbench_of(selected[0].table)
 
 
 def _log(robot: Path, port: str | None) -> ServoLog:
@@ -182,8 +182,8 @@ def _carry_out(
     if not any(each.is_needed for each in planned):
         say("Nothing is to be written.")
         return
-    asked = "Write it? Torque is switched off first: hold the arm"
-    if dry_run or not (yes or Confirm.ask(asked, console=console, default=False)):
+    question = "Write it? Torque is switched off first: hold the arm"
+    if dry_run or not (yes or Confirm.ask(question, console=console, default=False)):
         say("Nothing was written, and torque is as it was.")
         return
     done = carry_out(workbench, planned, log, SystemClock(), undoes=undoes)

@@ -22,8 +22,8 @@ from bodyschema.interfaces.waits import Waits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bodyschema.cli.hardware.joints_watch import JointsWatch, Seen
-    from bodyschema.daemon.sampler.sources import Powered
+    from bodyschema.cli.hardware.joints_watch import ArmState, JointsWatch
+    from bodyschema.daemon.sampler.sources import PoweredMode
 
 
 class _Settings:
@@ -173,19 +173,19 @@ def _line(text: str) -> None:
     sys.stdout.flush()
 
 
-def _first(watch: JointsWatch) -> Seen:
+def _first(watch: JointsWatch) -> ArmState:
     """Return the first complete state; raise SourceError if there is none in time."""
     end = time.monotonic() + _Settings.first_reading_s
     while time.monotonic() < end:
         if watch.look() is not None:
-            watch.know_temperatures()
-            seen = watch.look_all_over()
+            watch.read_temperatures()
+            seen = watch.look_at_all_servos()
             if seen is not None:
                 return seen
     raise SourceError("the joints cannot be read. `bodyschema doctor` shows why")
 
 
-def _begin(watch: JointsWatch, force: Powered) -> None:
+def _begin(watch: JointsWatch, force: PoweredMode) -> None:
     """Switch zero-force on and print its answer; raise RequestError if it is refused."""
     answer = force.ask(True)
     while not answer.done():
@@ -193,7 +193,7 @@ def _begin(watch: JointsWatch, force: Powered) -> None:
     sys.stderr.write(answer.result() + "\n")
 
 
-def _follow(watch: JointsWatch, flags: SignalFlags, every_s: float, show: Callable[[Seen], None]) -> None:
+def _follow(watch: JointsWatch, flags: SignalFlags, every_s: float, show: Callable[[ArmState], None]) -> None:
     shown_at = 0.0
     while not flags.ending:
         seen = watch.look()

@@ -119,8 +119,8 @@ def _from_standard_input(config: ClientConfig) -> JointsRequest:
     try:
         return decode(b'{"q":' + text + b"}", JointsRequest)
     except RequestError as error:
-        wanted = f"a JSON list of {len(config.joints)} numbers ({names}), or a list of such lists"
-        raise RequestError(f"standard input is not {wanted}") from error
+        expected = f"a JSON list of {len(config.joints)} numbers ({names}), or a list of such lists"
+        raise RequestError(f"standard input is not {expected}") from error
 
 
 def _show(reply: PredictReply) -> None:

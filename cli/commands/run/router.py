@@ -37,6 +37,6 @@ def router(
         print(config.as_zenohd())  # noqa: T201
         return
     logs.set_up(verbose=verbose)
-    wishes = SignalFlags()
-    with on_termination(wishes.end):
-        run_router(config, lambda: wishes.ending, Notifier.of_environment(), SystemClock())
+    signals = SignalFlags()
+    with on_termination(signals.end):
+        run_router(config, lambda: signals.ending, Notifier.of_environment(), SystemClock())

@@ -119,7 +119,7 @@ def _sampler(robot: Path, state_dir: Path | None, *, sim: bool, exit_at_end: boo
         service = Service(notifier, LOOPS, SystemClock(), devices=devices_of(config))
         process = Sampler(config, sources, bus, store, exit_at_end=exit_at_end, service=service)
         # In a terminal SIGHUP means that the terminal was closed.
-        with on_termination(process.stop, reload=process.reload if notifier.is_heard else None):
+        with on_termination(process.stop, reload=process.reload if notifier.is_connected else None):
             process.run()
 
 
@@ -136,6 +136,6 @@ def _learner(robots: tuple[Path, ...], state_dir: Path | None, processes: int, *
         return
     notifier, flags = Notifier.of_environment(), SignalFlags()
     # In a terminal SIGHUP means that the terminal was closed.
-    reload = flags.reload if notifier.is_heard else None
+    reload = flags.reload if notifier.is_connected else None
     with shown(files[0]) if view else nullcontext(), on_termination(flags.end, reload=reload):
         run_learners(configs, SystemClock(), flags, notifier)

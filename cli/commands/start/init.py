@@ -14,10 +14,10 @@ from rich.prompt import Prompt
 
 from bodyschema.cli.commands.options import HERE, flag, say, several
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
-from bodyschema.interfaces.whole_files import write_whole, writing
+from bodyschema.interfaces.whole_files import raising_write_errors, write_atomically
 
 if TYPE_CHECKING:
-    from bodyschema.cli.hardware.robot_template import Guess, Seen
+    from bodyschema.cli.hardware.robot_template import CameraFindings, Guess
     from bodyschema.cli.servos.fitting import Candidate, Fitting
 
 SCAN, ANY = "scan", "any"
@@ -79,7 +79,7 @@ def init(
     from bodyschema.cli.hardware.robot_template import EXAMPLE, guess_from, robot_toml
 
     seen = _seen(webcam, tag_mm, ball_mm, chessboard, plugged_in=bool(lerobot or source))
-    with writing(robot, remedy="Give another --robot"):
+    with raising_write_errors(robot, remedy="Give another --robot"):
         if sim:
             _copy_model(robot)
         elif lerobot is not None:
@@ -101,9 +101,9 @@ def _seen(
     chessboard: tuple[int, int, float] | None,
     *,
     plugged_in: bool,
-) -> Seen:
+) -> CameraFindings:
     """Return the cameras and the marker; the cameras are the connected ones if `plugged_in`."""
-    from bodyschema.cli.hardware.robot_template import Seen
+    from bodyschema.cli.hardware.robot_template import CameraFindings
     from bodyschema.daemon.wiring.wiring import connected_cameras
 
     markers = {"--tag-mm": tag_mm, "--ball-mm": ball_mm, "--chessboard": chessboard}
@@ -116,16 +116,18 @@ def _seen(
             what = f"the cameras here are {', '.join(cameras)}" if cameras else "no camera is plugged in"
             raise ConfigError(f"--webcam any: {what}", remedy="Give the name of one, from /dev/v4l/by-id")
         webcam = cameras[0]
-    return Seen(cameras, webcam, tag_mm, ball_mm, chessboard)
+    return CameraFindings(cameras, webcam, tag_mm, ball_mm, chessboard)
 
 
-def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], seen: Seen, *, yes: bool) -> None:
+def _with_servos(
+    guess: Guess, robot: Path, candidates: Sequence[Candidate], seen: CameraFindings, *, yes: bool
+) -> None:
     """Write robot.toml with a servo for each joint, and remove it again if it does not fit the URDF."""
     from bodyschema.cli.hardware.robot_template import robot_toml
     from bodyschema.cli.servos.fitting import first_of, fit, servo_tables
     from bodyschema.daemon.config import Config
 
-    fitting = fit(guess.joints, candidates, first_of if yes else _asked)
+    fitting = fit(guess.joints, candidates, first_of if yes else _asked_servo)
     text = robot_toml(guess._replace(joints=list(fitting.servos)), seen) + servo_tables(fitting)
     write_new(robot, text)
     try:
@@ -138,7 +140,7 @@ def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], see
 
 
 def _of_lerobot(
-    name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str], seen: Seen
+    name: str, urdf: Path | None, robot: Path, calibration: Path | None, ports: Sequence[str], seen: CameraFindings
 ) -> str:
     """Return a robot.toml for an arm of LeRobot."""
     from bodyschema.cli.hardware.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
@@ -164,8 +166,8 @@ def write_new(file: Path, text: str) -> None:
     """Write a new file; raise ConfigError if it exists."""
     if os.path.lexists(file):
         raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away")
-    with writing(file, remedy="Give another --robot"):
-        write_whole({file: text.encode()})
+    with raising_write_errors(file, remedy="Give another --robot"):
+        write_atomically({file: text.encode()})
 
 
 def _copy_model(robot: Path) -> None:
@@ -191,7 +193,7 @@ def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list
     return candidates_in(as_json(report).encode(), SCAN)
 
 
-def _asked(joint: str, left: Sequence[Candidate]) -> Candidate | None:
+def _asked_servo(joint: str, left: Sequence[Candidate]) -> Candidate | None:
     """Ask the user which servo moves `joint`; return it, or None."""
     if not left:
         return None
@@ -221,8 +223,8 @@ def _summary(fitting: Fitting) -> list[str]:
 
 def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf: Path | None) -> None:
     """Raise ConfigError if several ways to begin are given, or one without its required options."""
-    ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
-    if len(ways) > 1:
-        raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
+    sources = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
+    if len(sources) > 1:
+        raise ConfigError(f"{' and '.join(sources)} exclude each other", remedy="Give one of them")
     if source is not None and urdf is None:
         raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")

@@ -32,7 +32,7 @@ class Backlash(Presenter):
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
         k = residuals.run.simulation.place(effect).joint
         partial, _ = attributed(residuals, effect)
-        rows, x, y = residuals.telling(k), residuals.angles(k), residuals.as_angle(k, partial)
+        rows, x, y = residuals.rows_moved_by(k), residuals.angles(k), residuals.as_angle(k, partial)
         half = 0.5 * residuals.unit(k)[0] * float(effect.values[0])
         plot = Plot(
             f"{effect.where} [{residuals.unit(k)[1]}]",

@@ -31,7 +31,7 @@ class CameraLatency(Presenter):
         partial, own = attributed(residuals, effect)
         velocity = -residuals.run.columns(effect)[:, :, 0]
         speed = np.linalg.norm(velocity, axis=1)
-        y, fitted = (1e3 * speed * residuals.amount(velocity, e) for e in (partial, own))
+        y, fitted = (1e3 * speed * residuals.projected_amount(velocity, e) for e in (partial, own))
         rows, x = residuals.rows, 1e3 * speed
         slope = float(x[rows] @ fitted[rows]) / max(float(x[rows] @ x[rows]), 1e-12)
         ends = np.array([0.0, x[rows].max()])

@@ -15,8 +15,12 @@ class CameraScale(Presenter):
 
     def finding(self, found: FoundCause) -> str:
         error = found.numbers["scale_error"]
-        said = f"all that is measured is {100 * abs(error):.3g} % too {'large' if error > 0.0 else 'small'}"
-        return said if found.seen_by != "camera" else f"{said}: a tag, ball or board has another size than stated"
+        description = f"all that is measured is {100 * abs(error):.3g} % too {'large' if error > 0.0 else 'small'}"
+        return (
+            description
+            if found.seen_by != "camera"
+            else f"{description}: a tag, ball or board has another size than stated"
+        )
 
     def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         factor, calibration = 1.0 + found.numbers["scale_error"], workshop.robot.calibration

@@ -52,7 +52,7 @@ def over_reading(residuals: Residuals, effect: Effect) -> Panel:
     k = place.joint
     over = k if place.source is None else place.source
     partial, _ = attributed(residuals, effect)
-    rows, factor = residuals.telling(k), residuals.unit(k)[0]
+    rows, factor = residuals.rows_moved_by(k), residuals.unit(k)[0]
     q = np.zeros((_Settings.fine_points, len(residuals.robot.joints)))
     q[:, over] = np.linspace(*_ends(residuals.motion.q[rows, over]), _Settings.fine_points)
     assert isinstance(effect.kind, EncoderEffect)
@@ -83,7 +83,7 @@ def over_quantity(residuals: Residuals, effect: Effect, x: FloatArray, label: st
     k = residuals.run.simulation.place(effect).joint
     factor, unit = residuals.unit(k)
     partial, _ = attributed(residuals, effect)
-    rows = residuals.telling(k)
+    rows = residuals.rows_moved_by(k)
     order = rows[np.argsort(x[rows], kind="stable")]
     curve = (x[order], factor * correction[order])
     axes = (label, f"{effect.where}: true less read [{unit}]")
@@ -106,10 +106,10 @@ def remembered(residuals: Residuals, effect: Effect) -> FloatArray:
 
 def over_time_since(residuals: Residuals, effect: Effect) -> Panel:
     begins = float(residuals.clock[0]) - 1.0
-    always = residuals.instead(effect, np.append(effect.values[:-1], begins))
+    always = residuals.contribution_with(effect, np.append(effect.values[:-1], begins))
     partial, _ = attributed(residuals, effect)
     size = np.linalg.norm(always, axis=1)
-    y = 1e3 * residuals.amount(always, partial) * size
+    y = 1e3 * residuals.projected_amount(always, partial) * size
     fitted = 1e3 * size * after(residuals.motion, effect)
     rows = residuals.rows
     curve = (residuals.clock[rows], fitted[rows])

@@ -41,8 +41,8 @@ class Chain(ServoChain[Servo]):
     def _answers(self, instruction: Instruction, t: float, baud: int) -> list[Reply]:
         hearing = [s for s in self._listening(baud) if s.model.protocol == instruction.protocol]
         if not instruction.intact:
-            there = [s for s in hearing if s.id == instruction.id]
-            return self._together(there, t, _complain, Code.READ)
+            addressed = [s for s in hearing if s.id == instruction.id]
+            return self._common_answer(addressed, t, _complain, Code.READ)
         for servo in hearing:
             if _is_for(instruction, servo.id):
                 servo.hear(t)
@@ -58,15 +58,17 @@ class Chain(ServoChain[Servo]):
             return many(hearing, instruction, t)
         if instruction.id == BROADCAST:
             return self._broadcast(hearing, instruction, t)
-        there = [s for s in hearing if s.id == instruction.id]
-        return self._together(there, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code)
+        addressed = [s for s in hearing if s.id == instruction.id]
+        return self._common_answer(
+            addressed, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code
+        )
 
     def _obey(self, servo: Servo, instruction: Instruction, t: float) -> tuple[Error, bytes]:
         params, wide = instruction.params, instruction.protocol
         match instruction.code:
             case Code.PING:
-                told = servo["model"].to_bytes(2, "little") + bytes((servo["firmware"],))
-                return Error.NONE, told if wide == 2 else b""
+                answers = servo["model"].to_bytes(2, "little") + bytes((servo["firmware"],))
+                return Error.NONE, answers if wide == 2 else b""
             case Code.READ if len(params) == 2 * wide:
                 return self._read(servo, int.from_bytes(params[:wide], "little"), _number(params[wide:]), t)
             case Code.WRITE if len(params) > wide:
@@ -100,40 +102,40 @@ class Chain(ServoChain[Servo]):
         replies: list[Reply] = []
         for id in sorted(by_id):
             slot = t + id * PING_SLOT_S
-            replies += self._together(by_id[id], slot, lambda s, now: self._obey(s, instruction, now), Code.PING)
+            replies += self._common_answer(by_id[id], slot, lambda s, now: self._obey(s, instruction, now), Code.PING)
         return replies
 
     def _sync_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         address, size = _number(instruction.params[:2]), _number(instruction.params[2:4])
-        return self._in_turn(servos, [(id, address, size) for id in instruction.params[4:]], t, Code.READ)
+        return self._answers_in_turn(servos, [(id, address, size) for id in instruction.params[4:]], t, Code.READ)
 
     def _bulk_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         params = instruction.params
         if instruction.protocol == 1:  # a zero, then length, ID, address of each
             parts = [params[k : k + 3] for k in range(1, len(params) - 2, 3)]
-            return self._in_turn(servos, [(id, address, size) for size, id, address in parts], t, Code.READ)
-        return self._in_turn(servos, _bulk_parts(params), t, Code.READ)
+            return self._answers_in_turn(servos, [(id, address, size) for size, id, address in parts], t, Code.READ)
+        return self._answers_in_turn(servos, _bulk_parts(params), t, Code.READ)
 
     def _fast_bulk_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
-        return self._in_one(servos, _bulk_parts(instruction.params), t)
+        return self._fast_answer(servos, _bulk_parts(instruction.params), t)
 
     def _fast_sync_read(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         address, size = _number(instruction.params[:2]), _number(instruction.params[2:4])
-        return self._in_one(servos, [(id, address, size) for id in instruction.params[4:]], t)
+        return self._fast_answer(servos, [(id, address, size) for id in instruction.params[4:]], t)
 
-    def _in_one(self, servos: list[Servo], parts: list[tuple[int, int, int]], t: float) -> list[Reply]:
+    def _fast_answer(self, servos: list[Servo], parts: list[tuple[int, int, int]], t: float) -> list[Reply]:
         """Return the common answer of servos, given ID, address and size of each."""
         packet = fast_header([size for _, _, size in parts])
         start = now = t
         for place, (id, address, size) in enumerate(parts):
-            there = [s for s in servos if s.id == id and s.fast and s["status_return"] > 0]
-            if not there:  # a servo behind a missing one does not know when its turn comes
+            addressed = [s for s in servos if s.id == id and s.fast and s["status_return"] > 0]
+            if not addressed:  # a servo behind a missing one does not know when its turn comes
                 return [Reply(parts[0][0], start, packet)] if place else []
             if place == 0:
-                start = t + there[0].return_delay_s
+                start = t + addressed[0].return_delay_s
             now = start + len(packet) * self._byte_s
-            told = [(servo, *self._read(servo, address, size, now)) for servo in there]
-            packet += mixed([fast_block(packet, id, _error_byte(servo, error), data) for servo, error, data in told])
+            answers = [(servo, *self._read(servo, address, size, now)) for servo in addressed]
+            packet += mixed([fast_block(packet, id, _error_byte(servo, error), data) for servo, error, data in answers])
         return [Reply(parts[0][0], start, packet)] if parts else []
 
     def _sync_write(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:

@@ -92,22 +92,24 @@ class Chain(ServoChain[Servo]):
         hearing, params = self._listening(baud), instruction.params
         if instruction.code == Code.SYNC_READ:
             knowing = [servo for servo in hearing if servo.knows_sync_read]
-            asked = [(id, params[0], params[1]) for id in params[2:]]
-            return self._in_turn(knowing, asked, t, Code.SYNC_READ)
+            requested = [(id, params[0], params[1]) for id in params[2:]]
+            return self._answers_in_turn(knowing, requested, t, Code.SYNC_READ)
         if instruction.code == Code.SYNC_WRITE:
             if len(params) >= 2:
                 self._write_each(hearing, params[0], params[1], params[2:], t)
             return []
         is_for_all = instruction.id == BROADCAST
-        there = [servo for servo in hearing if is_for_all or servo.id == instruction.id]
-        there = [servo for servo in there if self._is_understood(servo, instruction)]
+        addressed = [servo for servo in hearing if is_for_all or servo.id == instruction.id]
+        addressed = [servo for servo in addressed if self._is_understood(servo, instruction)]
         if is_for_all and instruction.code != Code.PING:
-            for servo in there:
+            for servo in addressed:
                 self._obey(servo, instruction, t)
             return []
         if is_for_all:
-            return self._pinged(there, t)
-        return self._together(there, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code)
+            return self._pinged(addressed, t)
+        return self._common_answer(
+            addressed, t, lambda servo, now: self._obey(servo, instruction, now), instruction.code
+        )
 
     def _pinged(self, servos: list[Servo], t: float) -> list[Reply]:
         """Return the answers to a broadcast PING.

@@ -21,7 +21,7 @@ STAMPS = struct.Struct("<IIdQQQ")  # time code, its sub-frame, software time, mi
 TRACKED = 1
 SIZED_SINCE = (4, 1)  # each section begins with its size in bytes, and assets were added
 OLDEST, NEWEST = 3, 4
-MOST = 100_000  # elements of a section
+MAX_ITEMS = 100_000  # elements of a section
 VECTOR_BYTES, LABELLED_BYTES = 12, 26
 
 Version = tuple[int, int]
@@ -184,7 +184,7 @@ class _Reader:
     def count(self) -> int:
         """Read the number of elements of a section."""
         count = self.int32()
-        if not 0 <= count <= MOST:
+        if not 0 <= count <= MAX_ITEMS:
             raise Unusable(Fault.MALFORMED, f"{count} elements in a section")
         return count
 

@@ -12,7 +12,7 @@ import msgspec
 
 from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, BenchArm
-from bodyschema.drivers.bench.faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
+from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds, FaultSpec, WireFaults
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 
 from .board import EncoderBoard
@@ -32,14 +32,14 @@ class EncoderArm(BenchArm):
         config: SerialLinesConfig,
         angles: Mapping[str, Angle],
         *,
-        faults: Sequence[AskedFault] = (),
+        faults: Sequence[FaultSpec] = (),
         seed: int = 0,
         rate_hz: float = 200.0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, rng = config, Random(seed)
         self._names = {encoder.joint: encoder.name for encoder in config.encoders}
-        wire = WireFaults.asked(faults, KINDS, dict.fromkeys(self._names, 0), rng)  # one line contains all encoders
+        wire = WireFaults.requested(faults, KINDS, dict.fromkeys(self._names, 0), rng)  # one line contains all encoders
         encoders = {
             encoder.name: (_ticks(encoder), _shaft(encoder, angles[encoder.joint])) for encoder in config.encoders
         }

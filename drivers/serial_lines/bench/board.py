@@ -63,9 +63,9 @@ class EncoderBoard:
         """Return the lines that begin by `until`."""
         replies: list[Reply] = []
         while self._next_s <= until:
-            said = self._said(self._next_s)
-            replies.append(self.faults(Reply(0, self._next_s, said)))
-            self._next_s += max(self._period_s, len(said) * byte_s(baud))  # it measures once the last line is sent
+            data = self._lines_at(self._next_s)
+            replies.append(self.faults(Reply(0, self._next_s, data)))
+            self._next_s += max(self._period_s, len(data) * byte_s(baud))  # it measures once the last line is sent
         return [reply for reply in replies if reply.data]
 
     def _start(self, t: float, boot: int) -> None:
@@ -73,7 +73,7 @@ class EncoderBoard:
         self._seq, self._header_s = 0, -math.inf
         self._owes_header = True
 
-    def _said(self, t: float) -> bytes:
+    def _lines_at(self, t: float) -> bytes:
         line = self._reading(t)
         if self._owes_header or t - self._header_s >= HEADER_EVERY_S:
             self._owes_header, self._header_s = False, t
@@ -106,7 +106,7 @@ class Listener:
         self._source = source
         self._newest: JointReading | None = None
         self._error: BodyschemaError | None = None
-        self._told, self._stop = threading.Condition(), threading.Event()
+        self._changed, self._stop = threading.Condition(), threading.Event()
         self._thread = threading.Thread(target=self._listen, name="bench listener")
 
     def __enter__(self) -> Self:
@@ -119,8 +119,8 @@ class Listener:
 
     def after(self, t: float, timeout_s: float) -> JointReading | None:
         """Return the first reading after `t` [s], or None in time. Raise the error that ended the reading."""
-        with self._told:
-            self._told.wait_for(lambda: self._error is not None or self._is_after(t), timeout_s)
+        with self._changed:
+            self._changed.wait_for(lambda: self._error is not None or self._is_after(t), timeout_s)
             if self._error is not None:
                 raise self._error
             return self._newest if self._is_after(t) else None
@@ -133,10 +133,10 @@ class Listener:
             while not self._stop.is_set():
                 reading = self._source.read(Waits.poll_s)
                 if reading is not None:
-                    with self._told:
+                    with self._changed:
                         self._newest = reading
-                        self._told.notify_all()
+                        self._changed.notify_all()
         except BodyschemaError as error:
-            with self._told:
+            with self._changed:
                 self._error = error
-                self._told.notify_all()
+                self._changed.notify_all()

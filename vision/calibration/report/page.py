@@ -25,8 +25,8 @@ def page(found: Calibrated, gathered: Gathered) -> str:
     rig = found.rig
     style = files("bodyschema.vision.calibration.report").joinpath("page.css").read_text(encoding="utf-8")
     head = (
-        f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.made.held_out_px:.2f} px</h1>"
-        f'<p class="of">{escape(rig.made.board)} · {escape(rig.made.date[:10])} '
+        f"<h1>Cameras calibrated: views that were not fitted are foretold to {rig.provenance.held_out_px:.2f} px</h1>"
+        f'<p class="of">{escape(rig.provenance.board)} · {escape(rig.provenance.date[:10])} '
         f"· {' · '.join(_named(eye, serial) for eye, serial in _eyes(found, rig.serials))}</p>"
     )
     parts = (_tiles(found), _coverage(found), _residuals(found), _parameters(found), _views(found, gathered))
@@ -39,12 +39,12 @@ def page(found: Calibrated, gathered: Gathered) -> str:
 def _tiles(found: Calibrated) -> str:
     rig = found.rig
     calibration = Rectification(rig).calibration
-    rivals = ", ".join(f"{model} {px:.3f} px" for model, px in found.rivals_px.items())
+    rivals = ", ".join(f"{model} {px:.3f} px" for model, px in found.held_out_by_model_px.items())
     tiles = (
         *_baseline(found),
-        (f"{rig.made.held_out_px:.3f} px", "RMS error of views not fitted, per coordinate"),
-        (f"{rig.made.reprojection_px:.3f} px", "RMS error of the fit, per coordinate"),
-        (f"{rig.made.views}", f"views; {rig.made.left_out} left out"),
+        (f"{rig.provenance.held_out_px:.3f} px", "RMS error of views not fitted, per coordinate"),
+        (f"{rig.provenance.reprojection_px:.3f} px", "RMS error of the fit, per coordinate"),
+        (f"{rig.provenance.views}", f"views; {rig.provenance.left_out} left out"),
         (rig.model, f"lens model, by the error of views not fitted: {rivals}"),
         (f"{calibration.focal_px:.1f} px", "focal length of the rectified images"),
     )
@@ -78,10 +78,10 @@ def _coverage(found: Calibrated) -> str:
     )
     missing = found.coverage.missing()
     wishes = f"<ul>{''.join(f'<li>{escape(text)}' for text in missing)}</ul>" if missing else ""
-    said = "It would be better with these views:" if missing else "Nothing is missing."
+    verdict = "It would be better with these views:" if missing else "Nothing is missing."
     return (
         "<section><h2>Where the board was</h2><p>Every corner that was found. Red parts have too few: there the lens "
-        f'is a guess.</p><div class="pair">{figures}</div><p>{said}</p>{wishes}</section>'
+        f'is a guess.</p><div class="pair">{figures}</div><p>{verdict}</p>{wishes}</section>'
     )
 
 
@@ -110,7 +110,7 @@ def _parameters(found: Calibrated) -> str:
     )
     return (
         "<section><h2>Every parameter</h2><p>With 95 % intervals from the joint least-squares problem of all views. "
-        f"Lengths contain that the board's size is known to {rig.made.scale_sigma:.2%}.</p>"
+        f"Lengths contain that the board's size is known to {rig.provenance.scale_sigma:.2%}.</p>"
         f'<div class="scroll"><table><tr><th>parameter<th>value<th>95 %{rows}</table></div></section>'
     )
 

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from bodyschema.interfaces.errors import SourceError
-from bodyschema.vision.cameras.look import Look
+from bodyschema.vision.cameras.image_monitor import ImageMonitor
 from bodyschema.vision.cameras.pairing import Shot
 
 from .device import CameraDevice
@@ -32,7 +32,7 @@ class Capture:
             wake: called in the thread when it ends.
         """
         self._device, self._fps, self._take, self._wake = device, fps, take, wake
-        self.look = Look(device.name, fps)  # statistics of the camera from its images
+        self.look = ImageMonitor(device.name, fps)  # statistics of the camera from its images
         self.failure: SourceError | None = None  # error that ended the thread, or None
         self._opened = ExitStack()
         self._stopping = threading.Event()
@@ -44,7 +44,7 @@ class Capture:
         return self._device
 
     def __enter__(self) -> Self:
-        self.failure, self.look = None, Look(self._device.name, self._fps)
+        self.failure, self.look = None, ImageMonitor(self._device.name, self._fps)
         self._stopping.clear()
         self._opened.enter_context(self._device)
         self._thread = threading.Thread(target=self._run, name=self._device.name, daemon=True)
@@ -65,7 +65,7 @@ class Capture:
             while not self._stopping.is_set():
                 shot = self._device.read()
                 if shot is not None:
-                    self.look.see(shot.t, shot.image)
+                    self.look.add(shot.t, shot.image)
                     self._take(shot)
         except SourceError as error:
             self.failure = error

@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.vision.cameras.config import SideBySideConfig, UvcSettings
-from bodyschema.vision.cameras.look import LookSettings
+from bodyschema.vision.cameras.image_monitor import LookSettings
 
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE
 MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
@@ -103,15 +103,15 @@ def _control_complaints(capture: VideoCapture, settings: UvcSettings, name: str)
     for control in _controls(settings):
         if control.value is None:
             continue
-        wanted = control.value / control.unit
+        requested = control.value / control.unit
         if control.automatic is not None:
             capture.set(*control.automatic)
             if capture.get(control.automatic[0]) != control.automatic[1]:
                 yield f"the {name} does not switch its automatic for {control.key} off: see `v4l2-ctl -l`"
                 continue
-        capture.set(control.property, wanted)
+        capture.set(control.property, requested)
         got = capture.get(control.property)
-        if abs(got - wanted) > max(1.0, ROUNDING * wanted):
+        if abs(got - requested) > max(1.0, ROUNDING * requested):
             yield (
                 f"the {name} does not take {control.key} = {control.value:g}: it has {got * control.unit:g}. "
                 "`v4l2-ctl -l` shows its range"

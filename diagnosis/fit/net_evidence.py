@@ -17,17 +17,17 @@ class WorthSettings:
     # Cost of each further joint with the same kind of error, which is often set in one session [nats].
     another_nats = 2.0
     cheapest_nats = 1.5  # minimum cost of a parameter [nats]
-    rounds = 30  # fixed-point rounds of `rise_for`
+    rounds = 30  # fixed-point rounds of `required_rise`
 
 
-def nats(gain: float, dof: int) -> float:
+def evidence_gain(gain: float, dof: int) -> float:
     """Return the evidence gain of `dof` more parameters that raise twice the log-likelihood by `gain` [nats]."""
     if dof < 0:
-        return -nats(-gain, -dof)
-    return 0.5 * gain - cost(gain, dof)
+        return -evidence_gain(-gain, -dof)
+    return 0.5 * gain - parameter_cost(gain, dof)
 
 
-def cost(gain: float, dof: int) -> float:
+def parameter_cost(gain: float, dof: int) -> float:
     """Return the cost of `dof` parameters that raise twice the log-likelihood by `gain` [nats].
 
     The prior is Gaussian and scaled by empirical Bayes: the size that best explains the gain (George and Foster 2000,
@@ -36,24 +36,24 @@ def cost(gain: float, dof: int) -> float:
     return dof * max(0.5 + 0.5 * math.log(max(gain, 1e-300) / dof), WorthSettings.cheapest_nats) if dof else 0.0
 
 
-def rise_for(worth: float, dof: int) -> float:
-    """Return the rise of the log-likelihood for which `dof` more parameters are worth `worth` by `nats` [nats]."""
+def required_rise(evidence: float, dof: int) -> float:
+    """Return the rise of the log-likelihood at which `dof` more parameters gain `evidence` [nats]."""
     if dof < 0:
-        return -rise_for(-worth, -dof)
-    rise = worth + WorthSettings.cheapest_nats * dof
+        return -required_rise(-evidence, -dof)
+    rise = evidence + WorthSettings.cheapest_nats * dof
     for _ in range(WorthSettings.rounds if dof else 0):
-        rise = worth + cost(2.0 * rise, dof)
+        rise = evidence + parameter_cost(2.0 * rise, dof)
     return rise
 
 
-def choices(effect: Effect) -> float:
+def choice_count(effect: Effect) -> float:
     """Return the effective number of equally probable choices of an effect's free amounts."""
     if not effect.kind.in_parts or effect.free is None:
         return 1.0
-    return float(ways_to_choose(effect)[sum(1 << k for k in effect.amounts)])
+    return float(choice_counts(effect)[sum(1 << k for k in effect.amounts)])
 
 
-def ways_to_choose(effect: Effect) -> FloatArray:
+def choice_counts(effect: Effect) -> FloatArray:
     """Return the number of equally probable ways in which each set of an effect's numbers could have been chosen.
 
     In half of the cases the set is complete: all shifts, all rotations, or both, for a part that is mounted askew. In
@@ -62,7 +62,7 @@ def ways_to_choose(effect: Effect) -> FloatArray:
     Returns:
         One number for each sum of 2ᵏ over the free numbers k.
     """
-    amounts = effect.freeing(None).amounts
+    amounts = effect.with_free_amounts(None).amounts
     units: dict[str, int] = {}
     for k in amounts:
         unit = effect.parameters[k].name.rpartition("_")[2]

@@ -13,12 +13,12 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, frozen_array
 from bodyschema.vision.image_file import read_image
 
 from .config import ImagesConfig
-from .film import checked_times, read_times
+from .recorded_eyes import read_times, require_increasing
 
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
-class ImageRoll:
+class ImageReader:
     """The images that match a pattern for each eye, sorted by name; numbers in names sort as numbers.
 
     Attributes:
@@ -64,7 +64,7 @@ class ImageRoll:
             since = int(_ticks(self._eyes[0][0], 0))
             eyes = [[_ticks(file, since) / config.name_ticks_per_s for file in files] for files in self._eyes]
             left, right = frozen_array(eyes[0]), frozen_array(eyes[-1])
-            return checked_times(0.5 * (left + right), folder), frozen_array(np.abs(left - right))
+            return require_increasing(0.5 * (left + right), folder), frozen_array(np.abs(left - right))
         return frozen_array(np.arange(count) / (config.fps or 1.0)), together
 
     def open(self, place: int) -> None:

@@ -15,12 +15,12 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame, frozen_array
 from bodyschema.robot.limited import read_at_most
 
-from .look import of_image
+from .image_monitor import exposure_fault
 
-MOST_SAID = 200  # characters of a message that quotes a line of a file
+MAX_QUOTED_CHARS = 200  # characters of a message that quotes a line of a file
 
 
-class Roll(Protocol):
+class FrameReader(Protocol):
     """Recorded images of one eye or two, in order."""
 
     @property
@@ -48,7 +48,7 @@ class Roll(Protocol):
         ...
 
 
-class Film:
+class RecordedEyes:
     """`StereoEyes` that plays recorded images. Closing and reopening continues after the last image read.
 
     At a speed above 0 the times are the clock's, the first pair is due when the film is opened, and pairs not read in
@@ -59,7 +59,7 @@ class Film:
     def __init__(
         self,
         # creates the roll on first use; ConfigError or SourceError if files are missing or wrong
-        roll: Callable[[], Roll],
+        reader: Callable[[], FrameReader],
         clock: Clock,
         *,
         speed: float,
@@ -69,9 +69,9 @@ class Film:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         """Prepare the playback without opening files."""
-        self._make, self._clock, self._sleep = roll, clock, sleep
+        self._create_reader, self._clock, self._sleep = reader, clock, sleep
         self._speed, self._latency_s, self._sigma_s = speed, latency_s, sigma_s
-        self._roll: Roll | None = None
+        self._reader: FrameReader | None = None
         self._is_open = False
         self._next, self._start_s = 0, 0.0
         self._shown: tuple[ImageArray, ...] = ()
@@ -80,32 +80,32 @@ class Film:
     @property
     def image_size_px(self) -> tuple[int, int]:
         """Width and height of each eye's image."""
-        return self._made.image_size_px
+        return self._opened_reader.image_size_px
 
     @property
     def serials(self) -> tuple[str, ...]:
         """Files of each eye."""
-        return self._made.serials
+        return self._opened_reader.serials
 
     @property
     def health(self) -> tuple[str, ...]:
         """Exposure problems of the last pair; all other problems with files are errors."""
         names = ("left eye", "right eye") if len(self._shown) > 1 else ("camera",)
-        light = (of_image(image, name) for name, image in zip(names, self._shown, strict=False))
+        light = (exposure_fault(image, name) for name, image in zip(names, self._shown, strict=False))
         return tuple(text for text in light if text is not None)
 
     @property
-    def _made(self) -> Roll:
-        if self._roll is None:
-            self._roll = self._make()
-        return self._roll
+    def _opened_reader(self) -> FrameReader:
+        if self._reader is None:
+            self._reader = self._create_reader()
+        return self._reader
 
     def __enter__(self) -> Self:
-        roll = self._made
-        roll.open(self._next)
+        reader = self._opened_reader
+        reader.open(self._next)
         self._is_open = True
-        if self._speed and self._next < len(roll.t):
-            self._start_s = self._clock.now() - float(roll.t[self._next] - roll.t[0]) / self._speed
+        if self._speed and self._next < len(reader.t):
+            self._start_s = self._clock.now() - float(reader.t[self._next] - reader.t[0]) / self._speed
         return self
 
     def __exit__(
@@ -113,7 +113,7 @@ class Film:
     ) -> None:
         if self._is_open:
             self._is_open = False
-            self._made.close()
+            self._opened_reader.close()
 
     def read(self, timeout_s: float) -> StereoFrame | None:
         """Return the next pair of images, or None if none was due within `timeout_s`.
@@ -123,21 +123,21 @@ class Film:
         """
         if not self._is_open:
             raise SourceError("the images are not open")
-        roll = self._made
-        if self._next >= len(roll.t):
+        reader = self._opened_reader
+        if self._next >= len(reader.t):
             raise SourceEnded("the images are through")
         if self._speed and not self._is_due(timeout_s):
             return None
-        images = roll.next()
+        images = reader.next()
         if self._speed:
-            images = self._caught_up(images)
+            images = self._skip_to_due(images)
         place, self._next, self._shown = self._next, self._next + 1, images
-        t = self._due_s(place) if self._speed else float(roll.t[place])
-        sigma = float(np.hypot(roll.t_sigma[place], self._sigma_s))
+        t = self._due_s(place) if self._speed else float(reader.t[place])
+        sigma = float(np.hypot(reader.t_sigma[place], self._sigma_s))
         return StereoFrame(t - self._latency_s, images[0], images[1] if len(images) > 1 else None, sigma)
 
     def _due_s(self, place: int) -> float:
-        return self._start_s + float(self._made.t[place] - self._made.t[0]) / self._speed
+        return self._start_s + float(self._opened_reader.t[place] - self._opened_reader.t[0]) / self._speed
 
     def _is_due(self, timeout_s: float) -> bool:
         wait_s = self._due_s(self._next) - self._clock.now()
@@ -145,13 +145,13 @@ class Film:
             self._sleep(min(wait_s, timeout_s))
         return wait_s <= timeout_s
 
-    def _caught_up(self, images: tuple[ImageArray, ...]) -> tuple[ImageArray, ...]:
+    def _skip_to_due(self, images: tuple[ImageArray, ...]) -> tuple[ImageArray, ...]:
         """Return the newest pair that is due."""
         now = self._clock.now()
-        while self._next + 1 < len(self._made.t) and self._due_s(self._next + 1) <= now:
+        while self._next + 1 < len(self._opened_reader.t) and self._due_s(self._next + 1) <= now:
             self._next += 1
             self.dropped += 1
-            images = self._made.next()
+            images = self._opened_reader.next()
         return images
 
 
@@ -166,13 +166,15 @@ def read_times(file: Path, count: int) -> FloatArray:
         times = np.array([float(words[0]) for words in lines if words])
     except (OSError, ValueError) as error:
         remedy = "Write one time in seconds a line"
-        raise ConfigError(f"the times cannot be read: {str(error)[:MOST_SAID]}", file=file, remedy=remedy) from error
+        raise ConfigError(
+            f"the times cannot be read: {str(error)[:MAX_QUOTED_CHARS]}", file=file, remedy=remedy
+        ) from error
     if len(times) != count:
         raise ConfigError(f"has {len(times)} times for {count} pairs of images", file=file, remedy="Give one for each")
-    return checked_times(times, file)
+    return require_increasing(times, file)
 
 
-def checked_times(times: FloatArray, file: Path) -> FloatArray:
+def require_increasing(times: FloatArray, file: Path) -> FloatArray:
     """Return `times`; raise ConfigError with the first one that is not later than its predecessor."""
     wrong = np.flatnonzero(~(np.diff(times) > 0))
     if len(wrong) or not np.isfinite(times).all():

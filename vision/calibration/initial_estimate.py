@@ -37,9 +37,9 @@ def start(
     if len(eyes) == 1:
         alone = [pose for pose in poses["left"] if pose is not None]
         return lenses["left"].vector, np.array(alone)
-    rotation, translation = _between(poses["left"], poses["right"])
+    rotation, translation = _relative_pose(poses["left"], poses["right"])
     in_left = [
-        left if left is not None else _through(right, rotation, translation)
+        left if left is not None else _in_left_eye(right, rotation, translation)
         for left, right in zip(poses["left"], poses["right"], strict=True)
     ]
     vector = np.concatenate([lenses["left"].vector, lenses["right"].vector, rotation.as_rotvec(), translation])
@@ -96,7 +96,7 @@ def _fisheye(
     centre = (0.5 * (size_px[0] - 1), 0.5 * (size_px[1] - 1))
     lens = Lens("fisheye", (focal, focal), centre, (0.0,) * len(DISTORTION_NAMES["fisheye"]))
     try:
-        off = [
+        errors = [
             np.linalg.norm(
                 lens.project_posed(corners_m[each.numbers], *np.split(pose_of(each, corners_m, lens), 2))[0] - each.px,
                 axis=1,
@@ -105,10 +105,12 @@ def _fisheye(
         ]
     except (cv2.error, np.linalg.LinAlgError, ValueError):
         return lens, np.inf
-    return lens, float(np.median(np.concatenate(off)))
+    return lens, float(np.median(np.concatenate(errors)))
 
 
-def _between(left: Sequence[FloatArray | None], right: Sequence[FloatArray | None]) -> tuple[Rotation, FloatArray]:
+def _relative_pose(
+    left: Sequence[FloatArray | None], right: Sequence[FloatArray | None]
+) -> tuple[Rotation, FloatArray]:
     """Return the left eye's pose in the right one's frame, as a median over the views."""
     turns, places = [], []
     for a, b in zip(left, right, strict=True):
@@ -119,11 +121,11 @@ def _between(left: Sequence[FloatArray | None], right: Sequence[FloatArray | Non
         places.append(b[3:] - turn.apply(a[3:]))
     if len(turns) < 2:
         raise CalibrationError(f"both eyes saw the board in {len(turns)} views. Hold it where both see it")
-    apart = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
-    return turns[int(np.argmin(apart))], np.median(places, axis=0)
+    median_angles = [np.median([(turn * other.inv()).magnitude() for other in turns]) for turn in turns]
+    return turns[int(np.argmin(median_angles))], np.median(places, axis=0)
 
 
-def _through(right: FloatArray | None, rotation: Rotation, translation: FloatArray) -> FloatArray:
+def _in_left_eye(right: FloatArray | None, rotation: Rotation, translation: FloatArray) -> FloatArray:
     """Return the board's pose in the left eye's frame from that in the right one's."""
     if right is None:
         raise CalibrationError("a view that neither eye saw")

@@ -20,7 +20,7 @@ class LookSettings:
     step_px = 8  # between the pixels that are looked at
 
 
-def of_image(image: ImageArray, name: str) -> str | None:
+def exposure_fault(image: ImageArray, name: str) -> str | None:
     """Return the fault of the light in an image, or None."""
     levels = image[:: LookSettings.step_px, :: LookSettings.step_px]
     if is_black(levels):
@@ -30,7 +30,7 @@ def of_image(image: ImageArray, name: str) -> str | None:
     return None
 
 
-class Look:
+class ImageMonitor:
     """Monitor of one camera's images, fed by the capturing thread and queried by others."""
 
     def __init__(self, name: str, fps: float) -> None:
@@ -41,7 +41,7 @@ class Look:
         self.frames = 0  # number of images received
         self.fps: float | None = None
 
-    def see(self, t: float, image: ImageArray) -> None:
+    def add(self, t: float, image: ImageArray) -> None:
         """Check the newest image, taken at the time t [s]."""
         self.frames += 1
         self._times.append(t)
@@ -49,7 +49,7 @@ class Look:
             self._times.popleft()
         if t - self._looked_s >= LookSettings.every_s:
             self._looked_s = t
-            self._light = of_image(image, self._name)
+            self._light = exposure_fault(image, self._name)
             self.fps = self._rate()
 
     def _rate(self) -> float | None:
