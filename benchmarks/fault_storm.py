@@ -19,23 +19,23 @@ from functools import partial
 from random import Random
 from typing import Any
 
-from bodyschema.drivers.bench.device import Device, Fault
-from bodyschema.drivers.bench.faults import mute
-from bodyschema.drivers.dynamixel.bench.arm import swapped
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.arm import swapped
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.arm import swapped as swapped_feetech
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import Device, Fault
+from bodyschema.drivers.emulator.faults import mute
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.arm import swapped as swapped_feetech
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.emulator.board import EncoderBoard
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.errors import SourceLost
 from tests.daemon.virtual_port import VirtualClock, VirtualPort
@@ -94,7 +94,7 @@ def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fa
     ids = range(1, count + 1)
     chain = Chain(Servo(BY_NAME[model], k, swing(k), return_delay_s=0.0, booted_s=0.1 * k) for k in ids)
     port = _port(chain, clock, rng)
-    bus = BusConfig("bench", fast_sync_read="auto" if is_fast else "never")
+    bus = BusConfig("emulator", fast_sync_read="auto" if is_fast else "never")
     config = DynamixelConfig({"arm": bus}, tuple(ServoConfig(name, k, model) for k, name in enumerate(names(count), 1)))
     limits = [LIMITS] * count
     joints = DynamixelJoints(config, names(count), clock, limits=limits, open_port=lambda *_: (port, LATENCY_S))
@@ -108,7 +108,7 @@ def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
     chain = FeetechChain(servos)
     port = _port(chain, clock, rng)
     entries = tuple(ServoConfig(name, k, model) for k, name in enumerate(names(count), 1))
-    config = FeetechConfig({"arm": FeetechBus("bench")}, entries)
+    config = FeetechConfig({"arm": FeetechBus("emulator")}, entries)
     limits = [LIMITS] * count
     joints = FeetechJoints(config, names(count), clock, limits=limits, open_port=lambda *_: (port, LATENCY_S))
     step = FEETECH_MODELS[model].rad_per_tick
@@ -120,7 +120,7 @@ def lines(clock: VirtualClock, rng: Random, count: int) -> Rig:
     encoders = {name: (4096, swing(k)) for k, name in enumerate(names(count), 1)}
     board = EncoderBoard(encoders, begun_s=clock.now(), drift=1e-4)
     port = _port(board, clock, rng, LINE_BAUD)
-    config = SerialLinesConfig("bench", tuple(EncoderConfig(name) for name in names(count)), LINE_BAUD)
+    config = SerialLinesConfig("emulator", tuple(EncoderConfig(name) for name in names(count)), LINE_BAUD)
     joints = SerialLineJoints(config, names(count), clock, limits=[LIMITS] * count, open_port=lambda *_: port)
     return Rig(board, joints, lambda: board.lines, storm, 2 * math.pi / 4096, 1)
 

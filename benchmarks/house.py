@@ -22,13 +22,13 @@ NOT_PRODUCT = ("tests", "benchmarks", "docs", "examples")
 SMALL = 80
 # Numbers that nobody tuned: register tables, wire and file formats, in the modules that hold nothing else.
 TABLES = (
-    "drivers/dynamixel/bench/factory.py",
-    "drivers/dynamixel/bench/frames.py",
-    "drivers/dynamixel/bench/servo.py",
+    "drivers/dynamixel/emulator/factory.py",
+    "drivers/dynamixel/emulator/frames.py",
+    "drivers/dynamixel/emulator/servo.py",
     "drivers/dynamixel/crc16.py",
     "drivers/dynamixel/models.py",
     "drivers/dynamixel/packets.py",
-    "drivers/feetech/bench/servo.py",
+    "drivers/feetech/emulator/servo.py",
     "drivers/feetech/models.py",
     "drivers/markers/natnet/packets.py",
     "drivers/ros2/cdr.py",

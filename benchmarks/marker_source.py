@@ -31,8 +31,8 @@ from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.drivers.markers.datagram import SCHEMA
-from bodyschema.drivers.ros2.bench.node import Node
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.emulator.node import Node
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription

@@ -14,9 +14,9 @@ from multiprocessing.synchronize import Event
 
 import numpy as np
 
-from bodyschema.drivers.ros2.bench.node import Node
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.emulator.node import Node
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.interfaces.clock import SystemClock
 

@@ -14,19 +14,19 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.drivers.bench.device import Device, Sampling
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import Device, Sampling
+from bodyschema.drivers.emulator.pty_shell import PtyShell
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from bodyschema.drivers.servos.joints import ServoJoints

@@ -34,7 +34,7 @@ GROUPS = {
         "scan": "Find servos on all ports, rates and protocols.",
         "watch": "Show joints, cameras or other marker sources live.",
         "servos": "Read and write servo EEPROM settings, with undo.",
-        "bench": "Emulate the servos of robot.toml on a port.",
+        "emulate": "Emulate the servos of robot.toml on a port.",
     },
     "Data and fleet": {
         "record": "Save the running sampler's pairs to a file.",

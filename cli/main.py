@@ -44,6 +44,7 @@ RENAMED = {
     ("fleet", "list"): ("fleet",),
     ("fleet", "compare"): ("fleet", "--compare"),
     ("fleet", "diagnose"): ("fleet",),
+    ("bench",): ("emulate",),
 }
 # In cli/commands/, a folder for each group.
 _FOLDERS = dict(zip(GROUPS, ("start", "calibrate", "run", "hardware", "data"), strict=True))

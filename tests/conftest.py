@@ -166,7 +166,7 @@ def hidden_folder() -> Iterator[Path]:
 
 @pytest.fixture
 def patient_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for servos and encoders as long as a full machine may hold up the bench that answers for them."""
+    """Wait for servos and encoders as long as a full machine may hold up the emulator that answers for them."""
     monkeypatch.setattr("bodyschema.drivers.servos.bus.HOST_S", 1.0)
     monkeypatch.setattr("bodyschema.drivers.servos.scan.HOST_S", 1.0)
     monkeypatch.setattr("bodyschema.drivers.dynamixel.bus.HOST_S", 1.0)

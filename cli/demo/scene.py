@@ -152,7 +152,7 @@ def prepare(
 
 
 def _own_tables(seed: int, bus: Bus | None) -> str:
-    bench = "" if bus is None else f"servo_bench = true\n{_joints(bus)}"
+    emulator = "" if bus is None else f"servo_bench = true\n{_joints(bus)}"
     return f"""
 [zenoh]
 sampler = "{free_endpoint()}"
@@ -163,7 +163,7 @@ state_dir = "{STATE}"
 
 [sim]
 seed = {seed}
-{bench}"""
+{emulator}"""
 
 
 def _marker(marker: Marker, model: Path) -> str:

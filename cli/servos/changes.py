@@ -66,9 +66,7 @@ def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
     return found
 
 
-def plan(
-    workbench: EepromEditor, selected: Sequence[SelectedServo], assigned: Sequence[tuple[str, str]]
-) -> list[Planned]:
+def plan(editor: EepromEditor, selected: Sequence[SelectedServo], assigned: Sequence[tuple[str, str]]) -> list[Planned]:
     """Plan the writes. Queries the servos, and writes nothing.
 
     Raises:
@@ -79,14 +77,14 @@ def plan(
         raise ConfigError("several servos cannot get one ID", remedy="Name one, with --joint or --id")
     planned: list[Planned] = []
     for one in selected:
-        known = settings_by_name(workbench, one.model)
+        known = settings_by_name(editor, one.model)
         values = [(setting_called(name, known, one.model.name), text) for name, text in assigned]
         numbers = [(setting, setting.value(text)) for setting, text in values]
-        bus = workbench.bus(one.port, one.baud)
-        servo = workbench.identified_servo(bus, one.entry, one.model)
+        bus = editor.bus(one.port, one.baud)
+        servo = editor.identified_servo(bus, one.entry, one.model)
         for setting, target in numbers:
-            change = Change(servo, setting, workbench.value(bus, servo, setting), target)
-            if setting.name == ID and target != change.now and workbench.is_taken(bus, target):
+            change = Change(servo, setting, editor.value(bus, servo, setting), target)
+            if setting.name == ID and target != change.now and editor.is_taken(bus, target):
                 raise ConfigError(
                     f"the ID {target} is taken on {one.port}", remedy="`bodyschema scan` shows who is there"
                 )
@@ -94,7 +92,7 @@ def plan(
     return planned
 
 
-def plan_zeros(workbench: EepromEditor, selected: Sequence[SelectedServo]) -> list[Planned]:
+def plan_zeros(editor: EepromEditor, selected: Sequence[SelectedServo]) -> list[Planned]:
     """Plan homing offsets that set the joints to 0 at their present positions; writes nothing.
 
     Raises:
@@ -103,11 +101,11 @@ def plan_zeros(workbench: EepromEditor, selected: Sequence[SelectedServo]) -> li
     """
     planned = []
     for one in selected:
-        known = settings_by_name(workbench, one.model)
+        known = settings_by_name(editor, one.model)
         setting = setting_called(HOMING_OFFSET, known, one.model.name)
-        bus = workbench.bus(one.port, one.baud)
-        servo = workbench.identified_servo(bus, one.entry, one.model)
-        target = workbench.homing_offset(bus, servo)
+        bus = editor.bus(one.port, one.baud)
+        servo = editor.identified_servo(bus, one.entry, one.model)
+        target = editor.homing_offset(bus, servo)
         _require_effective(one, servo, setting, target)
         planned.append(Planned(one, Change(servo, setting, servo.homing_offset, target)))
     return planned
@@ -126,18 +124,18 @@ def _require_effective(selected: SelectedServo, servo: IdentifiedServo, setting:
         )
 
 
-def zero_ticks(workbench: EepromEditor, selected: Sequence[SelectedServo]) -> list[tuple[IdentifiedServo, int]]:
+def zero_ticks(editor: EepromEditor, selected: Sequence[SelectedServo]) -> list[tuple[IdentifiedServo, int]]:
     """Return each servo's present position: the zero_ticks that put its joint at 0 there. Writes nothing."""
     found = []
     for one in selected:
-        bus = workbench.bus(one.port, one.baud)
-        servo = workbench.identified_servo(bus, one.entry, one.model)
-        found.append((servo, workbench.position(bus, servo)))
+        bus = editor.bus(one.port, one.baud)
+        servo = editor.identified_servo(bus, one.entry, one.model)
+        found.append((servo, editor.position(bus, servo)))
     return found
 
 
 def carry_out(
-    workbench: EepromEditor, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
+    editor: EepromEditor, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
 ) -> list[WriteResult]:
     """Switch torque off and verify it, then write the changes; log each write before sending it to the servo.
 
@@ -147,30 +145,30 @@ def carry_out(
     """
     needed = [each for each in planned if each.is_needed]
     for each in needed:
-        workbench.torque_off(workbench.bus(each.selected.port, each.selected.baud), [each.change.servo])
+        editor.torque_off(editor.bus(each.selected.port, each.selected.baud), [each.change.servo])
     batch = max(log.batches(), default=0) + 1
     entries = {id(each.change): _entry(each, batch, clock.utc(), undoes) for each in needed}
     done: list[WriteResult] = []
     for _, together in groupby(needed, key=lambda each: (each.selected.port, each.change.setting.name)):
         group = list(together)
         log.append([entries[id(each.change)] for each in group])
-        results = _written(workbench, group)
+        results = _written(editor, group)
         log.append([msgspec.structs.replace(entries[id(one.change)], state=one.outcome.value) for one in results])
         done += results
     return done
 
 
-def _written(workbench: EepromEditor, group: Sequence[Planned]) -> list[WriteResult]:
+def _written(editor: EepromEditor, group: Sequence[Planned]) -> list[WriteResult]:
     """Write all planned values of one setting on one port; with baud rates, write all before querying any servo."""
     first = group[0]
     if first.change.setting.name != BAUD:
-        bus = workbench.bus(first.selected.port, first.selected.baud)
-        return [workbench.write(bus, each.change) for each in group]
+        bus = editor.bus(first.selected.port, first.selected.baud)
+        return [editor.write(bus, each.change) for each in group]
     done: list[WriteResult] = []
     for target in dict.fromkeys(each.change.target for each in group):
         changes = [each.change for each in group if each.change.target == target]
         rate = rate_of(first.change.setting, target)
-        done += workbench.write_bauds(first.selected.port, first.selected.baud, rate, changes)
+        done += editor.write_bauds(first.selected.port, first.selected.baud, rate, changes)
     return done
 
 
@@ -179,12 +177,12 @@ def rate_of(setting: Setting, value: int) -> int:
     return next(int(word) for word, known in setting.words.items() if known == value)
 
 
-def plan_undo(workbench: EepromEditor, entries: Sequence[LoggedWrite]) -> tuple[list[Planned], list[str]]:
+def plan_undo(editor: EepromEditor, entries: Sequence[LoggedWrite]) -> tuple[list[Planned], list[str]]:
     """Plan the writes that restore the old values; also return what is left unchanged, with reasons. Writes nothing."""
     planned, left = [], []
     for entry in reversed(entries):
         model = model_called(entry.table, entry.model)
-        setting = setting_called(entry.name, settings_by_name(workbench, model), model.name)
+        setting = setting_called(entry.name, settings_by_name(editor, model), model.name)
         place = msgspec.structs.replace(
             entry,
             id=entry.new if entry.name == ID else entry.id,
@@ -192,9 +190,9 @@ def plan_undo(workbench: EepromEditor, entries: Sequence[LoggedWrite]) -> tuple[
         )
         try:
             selected = SelectedServo(entry.table, place.port, place.baud, entry_of(entry.joint, place.id, model), model)
-            bus = workbench.bus(selected.port, selected.baud)
-            servo = workbench.identified_servo(bus, selected.entry, model)
-            now = workbench.value(bus, servo, setting)
+            bus = editor.bus(selected.port, selected.baud)
+            servo = editor.identified_servo(bus, selected.entry, model)
+            now = editor.value(bus, servo, setting)
         except BodyschemaError as error:
             left.append(str(error))
             continue

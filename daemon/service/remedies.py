@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 OPTION = "--robot"
 # The other commands take no robot.toml, or write one.
-_SINGLE = "backup, bench, command, config, doctor, ik, predict, record, run, scan, servos, status, watch"
+_SINGLE = "backup, command, config, doctor, emulate, ik, predict, record, run, scan, servos, status, watch"
 WITH_ROBOT = frozenset((*_SINGLE.split(", "), "calibrate latency"))
 _QUOTED = re.compile(r"`bodyschema ([^`]+)`")
 _LINE = re.compile(r"^bodyschema ([^#\n]+?)(?=\s*(?:#|$))")

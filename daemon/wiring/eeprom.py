@@ -15,10 +15,10 @@ from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
 from bodyschema.drivers.servos.config import ServoConfig
+from bodyschema.drivers.servos.eeprom_editor import Change, EepromEditor, Outcome, WriteResult
 from bodyschema.drivers.servos.model import Model
 from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
-from bodyschema.drivers.servos.workbench import Change, EepromEditor, Outcome, WriteResult
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.robot.suggest import did_you_mean
@@ -35,12 +35,12 @@ __all__ = [
     "Setting",
     "WriteResult",
     "configured",
+    "editor_of",
     "entry_of",
     "model_called",
     "setting_called",
     "settings_by_name",
     "stranger",
-    "workbench_of",
 ]
 
 STRANGER = "-"  # instead of a joint's name
@@ -90,8 +90,8 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[S
 def stranger(port: str, baud: int, id: int) -> SelectedServo:
     """Return the servo with an ID that robot.toml does not name, of any vendor; raise SourceError without an answer."""
     for table in [table for table, (_, _, bauds) in EEPROM_VENDORS.items() if baud in bauds]:
-        with workbench_of(table) as workbench:
-            model = workbench.model_at(workbench.bus(port, baud), id)
+        with editor_of(table) as editor:
+            model = editor.model_at(editor.bus(port, baud), id)
         if model is not None:
             return SelectedServo(table, port, baud, entry_of(STRANGER, id, model), model)
     raise SourceError(
@@ -100,7 +100,7 @@ def stranger(port: str, baud: int, id: int) -> SelectedServo:
     )
 
 
-def workbench_of(table: str) -> EepromEditor:
+def editor_of(table: str) -> EepromEditor:
     """Return the EEPROM editor for servos of a vendor."""
     clock = SystemClock()
 
@@ -115,8 +115,8 @@ def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
     return ServoConfig(joint, id, model.name)
 
 
-def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Setting]:
-    return {setting.name: setting for setting in workbench.vendor.settings(model)}
+def settings_by_name(editor: EepromEditor, model: Model) -> Mapping[str, Setting]:
+    return {setting.name: setting for setting in editor.vendor.settings(model)}
 
 
 def model_called(table: str, name: str) -> Model:

@@ -23,7 +23,7 @@ from bodyschema.daemon.sampler.sources import (
     Sources,
     StampedJoints,
 )
-from bodyschema.daemon.wiring.bench import require_bench, through_bench
+from bodyschema.daemon.wiring.emulators import require_emulator, through_emulator
 from bodyschema.daemon.wiring.simulation import simulation_settings
 from bodyschema.drivers.checks import Check
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
@@ -169,7 +169,7 @@ def _last_pose(config: Config) -> list[float] | None:
 
 def _require_source(config: Config, *, sim: bool) -> None:
     if sim and config.tables.sim.servo_bench:
-        require_bench(config)
+        require_emulator(config)
     if sim or config.tables.drivers.recording is not None:
         return
     if config.tables.drivers.hardware is None:
@@ -335,14 +335,14 @@ def _simulated_sources(config: Config) -> Iterator[Sources]:
     from bodyschema.sim_backend import SimWorld
     from bodyschema.sim_backend.world import exact_encoders
 
-    on_bench = config.tables.sim.servo_bench
+    on_emulator = config.tables.sim.servo_bench
     settings = simulation_settings(config)
-    settings = exact_encoders(settings) if on_bench else settings
+    settings = exact_encoders(settings) if on_emulator else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
         marker = _tracked(world.camera, config)
         joints: JointSource = world.joints
-        if on_bench:
-            joints = through_bench(
+        if on_emulator:
+            joints = through_emulator(
                 config, joints, lambda hardware: driver_of(hardware, config, SystemClock(), last_pose=None)
             )
         yield Sources(joints, marker, world.clock, world, picture=marker.picture)

@@ -1,1 +1,1 @@
-"""Driver for Dynamixel servos, with an emulator in `bench`."""
+"""Driver for Dynamixel servos, with an emulator."""

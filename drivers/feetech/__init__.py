@@ -1,1 +1,1 @@
-"""Driver for Feetech servos of the STS, SMS and SCS series, with an emulator in `bench`."""
+"""Driver for Feetech servos of the STS, SMS and SCS series, with an emulator."""

@@ -1,1 +1,1 @@
-"""Driver for custom encoders on a microcontroller that sends lines of text, with an emulator in `bench`."""
+"""Driver for custom encoders on a microcontroller that sends lines of text, with an emulator."""

@@ -17,8 +17,8 @@ import pytest
 from rich.console import Console
 
 from bodyschema.cli.hardware import doctor
-from bodyschema.cli.hardware.bench_run import BenchRun
 from bodyschema.cli.hardware.doctor import show
+from bodyschema.cli.hardware.emulator_run import EmulatorRun
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
@@ -57,8 +57,8 @@ def state(tmp_path, monkeypatch, free_endpoint) -> None:
 @pytest.mark.parametrize(
     ("file", "what"), [("servos.toml", "servos"), ("feetech.toml", "servos"), ("encoders.toml", "encoders")]
 )
-def test_healthy_bench_arm_passes_within_five_seconds(file, what, tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus") as run:
+def test_healthy_emulator_arm_passes_within_five_seconds(file, what, tmp_path, capsys) -> None:
+    with EmulatorRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus") as run:
         begin = time.monotonic()
         code = called("doctor", "--robot", run.robot_file, "--json")
         assert time.monotonic() - begin < LONGEST_S * max(1.0, os.getloadavg()[0])  # a full machine takes its time
@@ -79,7 +79,7 @@ def test_healthy_bench_arm_passes_within_five_seconds(file, what, tmp_path, caps
     ],
 )
 def test_overloaded_servo_exits_1_with_its_remedy(file, fault, fix, tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus", faults=[fault]) as run:
+    with EmulatorRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus", faults=[fault]) as run:
         code = called("doctor", "--robot", run.robot_file, "--json")
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
     assert code == 1
@@ -89,7 +89,7 @@ def test_overloaded_servo_exits_1_with_its_remedy(file, fault, fix, tmp_path, ca
 @pytest.mark.usefixtures("state")
 def test_a_sensor_without_a_value_is_wrong(tmp_path, capsys) -> None:
     arm = Config.load(EXAMPLE.with_name("encoders.toml"))
-    with BenchRun(arm, tmp_path / "bus", faults=["sensor@elbow_pitch"]) as run:
+    with EmulatorRun(arm, tmp_path / "bus", faults=["sensor@elbow_pitch"]) as run:
         assert called("doctor", "--robot", run.robot_file, "--json") == 1
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
     assert ["elbow_pitch" in check["said"] for check in wrong] == [True]
@@ -97,7 +97,7 @@ def test_a_sensor_without_a_value_is_wrong(tmp_path, capsys) -> None:
 
 @pytest.mark.usefixtures("state")
 def test_suggested_command_names_the_given_robot_file(tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["baud@elbow_pitch"]) as run:
+    with EmulatorRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["baud@elbow_pitch"]) as run:
         called("doctor", "--robot", run.robot_file, "--json")
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
     assert [check["fix"].partition("    #")[0] for check in wrong] == [f"bodyschema scan --robot {run.robot_file}"]
@@ -124,7 +124,7 @@ def test_missing_port_is_reported_once(capsys) -> None:
 
 @pytest.mark.usefixtures("state")
 def test_running_sampler_supplies_servo_findings(tmp_path, monkeypatch, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
+    with EmulatorRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
         config = Config.load(run.robot_file)
         holder = Holder(4711, "/usr/bin/python -m bodyschema run sampler --robot robot.toml")
         monkeypatch.setattr(checks, "holders", lambda *_: [holder])

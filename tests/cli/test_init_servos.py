@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.emulator_run import EmulatorRun
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import servos_of
@@ -142,7 +142,7 @@ def test_default_zero_of_a_model_is_written(tmp_path) -> None:
         ("feetech.toml", ["STS3215", "STS3250", "STS3215", "STS3215"]),
     ],
 )
-def test_bench_servos_are_found_and_written(file, models, tmp_path) -> None:
-    with BenchRun(Config.load(EXAMPLE / file, {}), tmp_path / "bus"):
+def test_emulator_servos_are_found_and_written(file, models, tmp_path) -> None:
+    with EmulatorRun(Config.load(EXAMPLE / file, {}), tmp_path / "bus"):
         new("--port", tmp_path / "bus", "--baud", 1000000, "--robot", tmp_path / "robot.toml", "--yes")
     assert [model for _, model in servos(tmp_path / "robot.toml").values()] == models

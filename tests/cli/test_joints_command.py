@@ -1,4 +1,4 @@
-"""`bodyschema watch joints`: an arm on the bench, moved joint by joint."""
+"""`bodyschema watch joints`: an arm on the emulator, moved joint by joint."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.emulator_run import EmulatorRun
 from bodyschema.cli.hardware.joints_watch import ArmState, JointState, JointsWatch, SignCheck, Speeds, screen, signs_in
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_joints
-from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
+from bodyschema.drivers.dynamixel.emulator.arm import DynamixelArm
+from bodyschema.drivers.emulator.dry_run import DryRun
 from bodyschema.interfaces.clock import SystemClock
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
@@ -84,7 +84,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path, p
     shoulder = [0.2]
     angles = {joint: (lambda _: 0.1) for joint in config.robot.joints} | {"shoulder_pitch": lambda _: shoulder[0]}
     servos = config.tables.drivers.dynamixel
-    with DryRun(DynamixelArm(servos, angles), {"arm": tmp_path / "bus"}) as bench:
+    with DryRun(DynamixelArm(servos, angles), {"arm": tmp_path / "bus"}) as emulator:
         (tmp_path / "desk_arm.urdf").write_bytes(config.robot.tree.file.read_bytes())
         (tmp_path / "robot.toml").write_text(
             EXAMPLE.read_text().replace(servos.buses["arm"].port, str(tmp_path / "bus"))
@@ -96,7 +96,7 @@ def test_the_watch_has_angles_speeds_temperatures_and_ranges(config, tmp_path, p
                 look_until(watch, lambda seen: abs(seen.joints[PITCH].angle - shoulder[0]) < 0.01)
             watch.read_temperatures()
             seen = look_until(watch, lambda seen: True)
-        assert bench.arm.count > 20
+        assert emulator.arm.count > 20
     pitch = seen.joints[PITCH]
     assert (pitch.low, pitch.high) == pytest.approx((0.2, 0.6), abs=0.01)
     assert [joint.temperature_c for joint in seen.joints] == [31.0] * 4
@@ -117,7 +117,7 @@ def look_until(watch: JointsWatch, done) -> ArmState:
     ("file", "ids"), [("servos.toml", [1, 2, 3, 4]), ("feetech.toml", [1, 2, 3, 4]), ("encoders.toml", [None] * 4)]
 )
 def test_once_gives_one_line_of_json(file, ids, tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE.with_name(file), {}), tmp_path / "bus") as run:
+    with EmulatorRun(Config.load(EXAMPLE.with_name(file), {}), tmp_path / "bus") as run:
         app(
             ["watch", "joints", "--robot", str(run.robot_file), "--once", "--json"],
             exit_on_error=False,
@@ -184,7 +184,7 @@ def test_angle_beyond_the_limits_is_reported() -> None:
 
 @pytest.mark.usefixtures("patient_host")
 def test_watch_reports_an_overloaded_servo(tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@wrist_roll"]) as run:
+    with EmulatorRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@wrist_roll"]) as run:
         app(["watch", "joints", "--robot", str(run.robot_file), "--once", "--json"], result_action="return_value")
     (complaint,) = json.loads(capsys.readouterr().out)["health"]
     assert complaint.startswith("joint 'wrist_roll': it is overloaded")

@@ -18,11 +18,11 @@ from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.wiring.wiring import open_joints
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.emulator.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.arm import Chain
-from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.emulator.pty_shell import PtyShell
+from bodyschema.drivers.feetech.emulator.arm import Chain
+from bodyschema.drivers.feetech.emulator.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError

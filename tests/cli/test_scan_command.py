@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.emulator_run import EmulatorRun
 from bodyschema.cli.hardware.scan_report import ScanReport, as_json, report_of, show
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
@@ -131,8 +131,8 @@ def test_json_has_ports_joints_and_strangers(config, arm, port) -> None:
 
 
 @pytest.mark.usefixtures("patient_host")
-def test_a_bench_is_found_by_the_command(tmp_path, capsys) -> None:
-    with BenchRun(Config.load(EXAMPLE, {}), tmp_path / "bus") as run:
+def test_emulator_is_found_by_the_command(tmp_path, capsys) -> None:
+    with EmulatorRun(Config.load(EXAMPLE, {}), tmp_path / "bus") as run:
         arguments = ["scan", "--port", tmp_path / "bus", "--baud", 1000000, "--robot", run.robot_file, "--json"]
         app(list(map(str, arguments)), exit_on_error=False, result_action="return_value")
     told = json.loads(capsys.readouterr().out)

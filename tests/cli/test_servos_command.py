@@ -13,15 +13,15 @@ import pytest
 from bodyschema.cli.main import command_line
 from bodyschema.cli.servos.log import FILE, LoggedWrite, ServoLog
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring.bench import Motion, bench_robot_file, open_bench
-from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.daemon.wiring.emulators import Motion, emulator_robot_file, open_emulator
+from bodyschema.drivers.emulator.dry_run import DryRun
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RequestError, SourceError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "desk_arm" / "servos.toml"
 ELBOW = ("--joint", "elbow_pitch")
 
 
-class Bench:
+class Emulator:
     """The desk arm's servos on a port, and the command."""
 
     def __init__(self, dry_run: DryRun, robot: Path) -> None:
@@ -49,72 +49,72 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, patient_host: None) -> Iterator[Bench]:
+def emulator(tmp_path: Path, patient_host: None) -> Iterator[Emulator]:
     config = Config.load(EXAMPLE, {})
     port = tmp_path / "bus"
     motion = Motion(dict.fromkeys(config.robot.joints, lambda _: 0.2), "standing still")
-    with open_bench(config, port, motion, faults=["torque@elbow_pitch"], return_delay_s=5e-4, seed=0) as dry_run:
-        yield Bench(dry_run, bench_robot_file(config, dry_run, port))
+    with open_emulator(config, port, motion, faults=["torque@elbow_pitch"], return_delay_s=5e-4, seed=0) as dry_run:
+        yield Emulator(dry_run, emulator_robot_file(config, dry_run, port))
 
 
-def test_dry_run_shows_table_and_writes_nothing(bench, capsys) -> None:
-    assert bench("return_delay=0", *ELBOW, "--dry-run") == 0
+def test_dry_run_shows_table_and_writes_nothing(emulator, capsys) -> None:
+    assert emulator("return_delay=0", *ELBOW, "--dry-run") == 0
     assert "elbow_pitch   3  return_delay (9)  250 (500 µs)  →  0 (0 µs)" in capsys.readouterr().out
-    assert (bench.elbow("return_delay"), bench.elbow("torque")) == (250, 1)
-    assert not bench.robot.with_name("bus.state").exists()
+    assert (emulator.elbow("return_delay"), emulator.elbow("torque")) == (250, 1)
+    assert not emulator.robot.with_name("bus.state").exists()
 
 
-def test_sdk_reads_the_written_settings(bench) -> None:
-    assert bench("return_delay=0", "operating_mode=current", *ELBOW, "--yes") == 0
-    port = sdk.PortHandler(str(bench.robot.with_name("bus")))
+def test_sdk_reads_the_written_settings(emulator) -> None:
+    assert emulator("return_delay=0", "operating_mode=current", *ELBOW, "--yes") == 0
+    port = sdk.PortHandler(str(emulator.robot.with_name("bus")))
     port.setBaudRate(1_000_000)
     found = [sdk.PacketHandler(2.0).read1ByteTxRx(port, 3, address)[0] for address in (9, 11, 64)]
     port.closePort()
     assert found == [0, 0, 0]
 
 
-def test_each_write_is_logged_before_and_after(bench) -> None:
-    bench("return_delay=0", *ELBOW, "--yes")
-    assert [(line.old, line.new, line.state) for line in bench.log] == [(250, 0, "begun"), (250, 0, "written")]
+def test_each_write_is_logged_before_and_after(emulator) -> None:
+    emulator("return_delay=0", *ELBOW, "--yes")
+    assert [(line.old, line.new, line.state) for line in emulator.log] == [(250, 0, "begun"), (250, 0, "written")]
 
 
-def test_undo_takes_back_one_command_after_the_other(bench) -> None:
-    bench("return_delay=0", *ELBOW, "--yes")
-    bench("id=9", *ELBOW, "--yes")
-    assert bench("--undo", "--yes") == 0
-    assert (bench.elbow("id"), bench.elbow("return_delay")) == (3, 0)
-    assert bench("--undo", "--yes") == 0
-    assert bench.elbow("return_delay") == 250
+def test_undo_takes_back_one_command_after_the_other(emulator) -> None:
+    emulator("return_delay=0", *ELBOW, "--yes")
+    emulator("id=9", *ELBOW, "--yes")
+    assert emulator("--undo", "--yes") == 0
+    assert (emulator.elbow("id"), emulator.elbow("return_delay")) == (3, 0)
+    assert emulator("--undo", "--yes") == 0
+    assert emulator.elbow("return_delay") == 250
     with pytest.raises(ConfigError, match="nothing to take back"):
-        bench("--undo", "--yes")
+        emulator("--undo", "--yes")
 
 
-def test_undo_skips_settings_changed_by_others(bench, capsys) -> None:
-    bench("return_delay=0", *ELBOW, "--yes")
-    bench.dry_run.arm.servo("elbow_pitch")["return_delay"] = 7
-    assert bench("--undo", "--yes") == 0
-    assert bench.elbow("return_delay") == 7
+def test_undo_skips_settings_changed_by_others(emulator, capsys) -> None:
+    emulator("return_delay=0", *ELBOW, "--yes")
+    emulator.dry_run.arm.servo("elbow_pitch")["return_delay"] = 7
+    assert emulator("--undo", "--yes") == 0
+    assert emulator.elbow("return_delay") == 7
     assert "left alone: elbow_pitch (ID 3): return_delay is 7" in capsys.readouterr().out
 
 
-def test_a_rate_is_changed_and_taken_back(bench) -> None:
-    assert bench("baud=57600", "--joint", "base_yaw", "--yes") == 0
-    assert bench.dry_run.arm.servo("base_yaw").baud == 57_600
-    assert bench("--port", str(bench.robot.with_name("bus")), "--id", "1", "--baud", "57600") == 0
-    assert bench("--undo", "--yes") == 0
-    assert bench.dry_run.arm.servo("base_yaw").baud == 1_000_000
+def test_a_rate_is_changed_and_taken_back(emulator) -> None:
+    assert emulator("baud=57600", "--joint", "base_yaw", "--yes") == 0
+    assert emulator.dry_run.arm.servo("base_yaw").baud == 57_600
+    assert emulator("--port", str(emulator.robot.with_name("bus")), "--id", "1", "--baud", "57600") == 0
+    assert emulator("--undo", "--yes") == 0
+    assert emulator.dry_run.arm.servo("base_yaw").baud == 1_000_000
 
 
-def test_zero_prints_current_ticks_and_writes_nothing(bench, capsys) -> None:
-    assert bench("--zero", *ELBOW) == 0
+def test_zero_prints_current_ticks_and_writes_nothing(emulator, capsys) -> None:
+    assert emulator("--zero", *ELBOW) == 0
     ticks = 2048 - round(0.2 * 4096 / (2 * 3.141592653589793))  # it counts against the joint
     assert f"elbow_pitch  zero_ticks = {ticks}" in capsys.readouterr().out
-    assert bench.elbow("homing_offset") == 0
+    assert emulator.elbow("homing_offset") == 0
 
 
-def test_zero_in_the_servo_makes_here_the_zero(bench) -> None:
-    assert bench("--zero", "--in-servo", *ELBOW, "--yes") == 0
-    assert bench.dry_run.arm.servo("elbow_pitch").position(0.0) == 2048
+def test_zero_in_the_servo_makes_here_the_zero(emulator) -> None:
+    assert emulator("--zero", "--in-servo", *ELBOW, "--yes") == 0
+    assert emulator.dry_run.arm.servo("elbow_pitch").position(0.0) == 2048
 
 
 @pytest.mark.parametrize(
@@ -132,33 +132,33 @@ def test_zero_in_the_servo_makes_here_the_zero(bench) -> None:
         (("return_delay=0", "--joint", "elbow"), "Did you mean 'elbow_pitch'"),
     ],
 )
-def test_invalid_settings_are_refused_and_nothing_is_written(bench, words, said) -> None:
+def test_invalid_settings_are_refused_and_nothing_is_written(emulator, words, said) -> None:
     with pytest.raises(BodyschemaError, match=said):
-        bench(*words, "--yes")
-    assert bench.elbow("torque") == 1
+        emulator(*words, "--yes")
+    assert emulator.elbow("torque") == 1
 
 
-def test_a_servo_that_does_not_answer_is_named(bench) -> None:
-    bench.dry_run.arm.chains["arm"].servos.pop(2)
+def test_a_servo_that_does_not_answer_is_named(emulator) -> None:
+    emulator.dry_run.arm.chains["arm"].servos.pop(2)
     with pytest.raises(SourceError, match=r"'elbow_pitch' \(ID 3, XM430-W350\).*no answer"):
-        bench("return_delay=0", *ELBOW, "--yes")
+        emulator("return_delay=0", *ELBOW, "--yes")
 
 
-def test_log_with_truncated_last_line_is_read(bench) -> None:
-    bench("return_delay=0", *ELBOW, "--yes")
-    log = ServoLog(bench.robot.with_name("bus.state"))
+def test_log_with_truncated_last_line_is_read(emulator) -> None:
+    emulator("return_delay=0", *ELBOW, "--yes")
+    log = ServoLog(emulator.robot.with_name("bus.state"))
     with log.file.open("ab") as stream:
         stream.write(b'{"utc":"2026')
     assert [entry.new for entry in log.to_undo()] == [0]
 
 
-def test_settings_are_printed_as_json_too(bench, capsys) -> None:
-    assert bench("--json", *ELBOW) == 0
+def test_settings_are_printed_as_json_too(emulator, capsys) -> None:
+    assert emulator("--json", *ELBOW) == 0
     (servo,) = json.loads(capsys.readouterr().out)["servos"]
     assert (servo["joint"], servo["settings"]["return_delay"]["value"]) == ("elbow_pitch", 250)
 
 
 @pytest.mark.parametrize("words", [("id=9", "--undo"), ("--zero", "--undo", *ELBOW), ("--in-servo",)])
-def test_two_requests_at_once_are_refused(bench, words) -> None:
+def test_two_requests_at_once_are_refused(emulator, words) -> None:
     with pytest.raises(RequestError):
-        bench(*words)
+        emulator(*words)

@@ -25,18 +25,18 @@ from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.cli.demo.scene import cube_tables
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring.bench import through_bench
+from bodyschema.daemon.wiring.emulators import through_emulator
 from bodyschema.daemon.wiring.wiring import driver_of
-from bodyschema.drivers.bench.device import Faults
-from bodyschema.drivers.dynamixel.bench.chain import Chain, no_faults
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain, no_faults
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import Faults
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 from bodyschema.drivers.markers.config import UdpTable
@@ -45,12 +45,12 @@ from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.drivers.markers.report import Packet
 from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.replay import Replay
-from bodyschema.drivers.ros2.bench.node import Node, Send
 from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.emulator.node import Node, Send
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.drivers.ros2.messages import encode_joint_state
-from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.emulator.board import EncoderBoard
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
@@ -308,29 +308,29 @@ def tracked_tags() -> Iterator[Rig]:
 
 
 @contextmanager
-def servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
+def emulated_servos(faults: Faults = no_faults) -> Iterator[Rig]:
     clock = VirtualClock()
     chain = Chain((Servo(BY_NAME["XM430-W350"], id, swinging(id)) for id in (1, 2)), faults)
     config = DynamixelConfig(
-        {"arm": BusConfig("bench")}, tuple(ServoConfig(name, id, "XM430-W350") for name, id in (("a", 1), ("b", 2)))
+        {"arm": BusConfig("emulator")}, tuple(ServoConfig(name, id, "XM430-W350") for name, id in (("a", 1), ("b", 2)))
     )
     yield Rig(DynamixelJoints(config, ("a", "b"), clock, open_port=lambda *_: (VirtualPort(chain, clock), 0.0)))
 
 
 @contextmanager
-def feetech_servos_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
+def emulated_feetech_servos(faults: Faults = no_faults) -> Iterator[Rig]:
     clock = VirtualClock()
     chain = FeetechChain((FeetechServo(FEETECH_MODELS["STS3215"], id, swinging(id)) for id in (1, 2)), faults)
     servos = tuple(ServoConfig(name, id, "STS3215") for name, id in (("a", 1), ("b", 2)))
-    config = FeetechConfig({"arm": FeetechBus("bench")}, servos)
+    config = FeetechConfig({"arm": FeetechBus("emulator")}, servos)
     yield Rig(FeetechJoints(config, ("a", "b"), clock, open_port=lambda *_: (VirtualPort(chain, clock), 0.0)))
 
 
 @contextmanager
-def encoders_on_the_bench(faults: Faults = no_faults) -> Iterator[Rig]:
+def emulated_encoders(faults: Faults = no_faults) -> Iterator[Rig]:
     clock = VirtualClock()
     board = EncoderBoard({"a": (4096, swinging(1)), "b": (1024, swinging(2))}, begun_s=99.0, faults=faults)
-    config = SerialLinesConfig("bench", (EncoderConfig("a"), EncoderConfig("b")))
+    config = SerialLinesConfig("emulator", (EncoderConfig("a"), EncoderConfig("b")))
     yield Rig(SerialLineJoints(config, ("a", "b"), clock, open_port=lambda *_: VirtualPort(board, clock, 115_200)))
 
 
@@ -338,7 +338,7 @@ ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 
 
 @contextmanager
-def through_a_bench(file: str, tables: str = "") -> Iterator[Rig]:
+def read_through_emulator(file: str, tables: str = "") -> Iterator[Rig]:
     """Yield joints of another source, read from an emulator by the driver that a robot.toml configures."""
     with TemporaryDirectory() as folder:
         arm = shutil.copytree(ARM, Path(folder) / "arm")
@@ -348,28 +348,28 @@ def through_a_bench(file: str, tables: str = "") -> Iterator[Rig]:
         poses = [JointReading(t, frozen_array([0.01 * k, 0.1, -0.01 * k, 0.2])) for k, t in enumerate(TIMES.tolist())]
         scripted = Scripted(poses, config.robot.joints)
         clock = SystemClock()
-        yield Rig(through_bench(config, scripted, lambda there: driver_of(there, config, clock, last_pose=None)))
+        yield Rig(through_emulator(config, scripted, lambda there: driver_of(there, config, clock, last_pose=None)))
 
 
 def through_dynamixel_servos() -> AbstractContextManager[Rig]:
-    return through_a_bench("servos.toml")
+    return read_through_emulator("servos.toml")
 
 
 def through_feetech_servos() -> AbstractContextManager[Rig]:
-    return through_a_bench("feetech.toml")
+    return read_through_emulator("feetech.toml")
 
 
 def through_encoders() -> AbstractContextManager[Rig]:
-    return through_a_bench("encoders.toml")
+    return read_through_emulator("encoders.toml")
 
 
 def through_ros_2() -> AbstractContextManager[Rig]:
-    return through_a_bench("robot.toml", '\n[drivers.ros2]\nrouter = "tcp/127.0.0.1:17447"\n')
+    return read_through_emulator("robot.toml", '\n[drivers.ros2]\nrouter = "tcp/127.0.0.1:17447"\n')
 
 
 def servos_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
-    return servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
+    return emulated_servos(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
 
 
 @contextmanager
@@ -386,12 +386,12 @@ def ros_2_robot_that_falls_silent() -> AbstractContextManager[Rig]:
 
 def feetech_servos_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
-    return feetech_servos_on_the_bench(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
+    return emulated_feetech_servos(lambda reply: reply if next(said) < 30 else replace(reply, data=b""))
 
 
 def encoders_that_fall_silent() -> AbstractContextManager[Rig]:
     said = count()
-    return encoders_on_the_bench(lambda reply: reply if next(said) < 300 else replace(reply, data=b""))
+    return emulated_encoders(lambda reply: reply if next(said) < 300 else replace(reply, data=b""))
 
 
 class SentPositions:
@@ -437,7 +437,7 @@ def swinging(id: int) -> Callable[[float], float]:
 THROUGH = [through_dynamixel_servos, through_feetech_servos, through_encoders, through_ros_2]
 SIMULATED = pytest.mark.skipif(find_spec("pybullet") is None, reason="no pybullet; to run it: pip install -e '.[sim]'")
 ENDING_JOINTS = [replayed_joints, scripted_joints, pytest.param(simulated_joints, marks=SIMULATED), *THROUGH]
-JOINTS = [*ENDING_JOINTS, servos_on_the_bench, feetech_servos_on_the_bench, encoders_on_the_bench, ros_2_robot]
+JOINTS = [*ENDING_JOINTS, emulated_servos, emulated_feetech_servos, emulated_encoders, ros_2_robot]
 SILENT_SERVOS = [servos_that_fall_silent, feetech_servos_that_fall_silent]
 SILENT = [*SILENT_SERVOS, encoders_that_fall_silent, ros_2_robot_that_falls_silent]
 CAMERAS = [pytest.param(camera, marks=SIMULATED) for camera in (simulated_camera, rectified_camera)]
@@ -461,7 +461,7 @@ def shared() -> Iterator[Shared]:
 
 @pytest.fixture(autouse=True)
 def _patience(request: pytest.FixtureRequest) -> None:
-    """Wait for a bench that a full machine holds up; only sources that fall silent have to be found silent."""
+    """Wait for an emulator that a full machine holds up; only sources that fall silent have to be found silent."""
     if "[through_" in request.node.name:
         request.getfixturevalue("patient_host")
 
@@ -628,7 +628,7 @@ def test_eyes_tell_their_devices_apart(looks) -> None:
 
 
 def read_through(make: Make, attempts: int = 5) -> list[Any]:
-    """Return the rows that come through a bench; begin again where a busy host held its lines up."""
+    """Return the rows that come through an emulator; begin again where a busy host held its lines up."""
     for _ in range(attempts - 1):
         with suppress(SourceLost), make() as rig, rig.opened():
             return rig.read(ROWS)

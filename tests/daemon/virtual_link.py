@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from heapq import heappop, heappush, heapreplace
 from typing import Protocol
 
-from bodyschema.drivers.ros2.bench.node import Node, Sent
+from bodyschema.drivers.ros2.emulator.node import Node, Sent
 from bodyschema.drivers.ros2.link import Sample
 from bodyschema.interfaces.protocols import Clock
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from heapq import heappop, heappush
 
-from bodyschema.drivers.bench.device import Device, Reply, byte_s
+from bodyschema.drivers.emulator.device import Device, Reply, byte_s
 
 
 class VirtualClock:

@@ -8,9 +8,9 @@ from typing import Literal
 from servo_arm import Path, ServoArm
 from virtual_port import VirtualPort
 
-from bodyschema.drivers.feetech.bench.arm import Chain, Code, Instruction, instructions_in
-from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
+from bodyschema.drivers.feetech.emulator.arm import Chain, Code, Instruction, instructions_in
+from bodyschema.drivers.feetech.emulator.servo import Servo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME
 
@@ -55,5 +55,5 @@ class FeetechArm(ServoArm):
 
         wire = {"latency_s": latency_s, "held_s": held_s, "seed": seed}
         super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, **wire)
-        config = FeetechConfig({"arm": BusConfig("bench", sync_read=sync)}, self.entries(ServoConfig), **settings)
+        config = FeetechConfig({"arm": BusConfig("emulator", sync_read=sync)}, self.entries(ServoConfig), **settings)
         self.driven(FeetechJoints, config, limits=limits, last_pose=last_pose)

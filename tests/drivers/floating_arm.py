@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from operator import truediv
 
 import numpy as np
-from bench_arm import HeardPort
+from emulated_arm import HeardPort
 from virtual_port import VirtualClock
 from wire_faults import Planned
 
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.guard import GuardSettings
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME, TORQUE_AT_CURRENT
@@ -123,7 +123,7 @@ class FloatingArm:
             ServoConfig(name, id, MODEL, direction=1 if way > 0 else -1)
             for id, (name, way) in enumerate(zip(self.names, told, strict=True), 1)
         )
-        self.config = DynamixelConfig({"arm": BusConfig("bench")}, entries, zero_force=self.table, rate_hz=rate_hz)
+        self.config = DynamixelConfig({"arm": BusConfig("emulator")}, entries, zero_force=self.table, rate_hz=rate_hz)
         self.force = ZeroForce(self.config, self.table, self.names, torques, self.clock)
         self.joints = DynamixelJoints(
             self.config, self.names, self.clock, open_port=lambda *_: (self.port, 0.0), drives=[self.force]

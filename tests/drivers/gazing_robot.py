@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from bench_arm import HeardPort
+from emulated_arm import HeardPort
 from virtual_port import VirtualClock
 from wire_faults import Planned
 
 from bodyschema.daemon.sampler.gaze_loop import GazeLoop, HandModel
 from bodyschema.daemon.wiring.wiring import demonstration_model
-from bodyschema.drivers.dynamixel.bench.arm import DrivenShaft
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.arm import DrivenShaft
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.gaze import Gaze
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
@@ -66,7 +66,7 @@ class GazingRobot:
         self.port = HeardPort(self.chain, self.clock)
         self.table = GazeConfig(joints=HEAD, **{"max_speed_deg_s": 60.0, **settings})
         entries = tuple(ServoConfig(joint, id, MODEL) for id, joint in enumerate(robot.joints, 1))
-        self.config = DynamixelConfig({"arm": BusConfig("bench")}, entries, gaze=self.table, rate_hz=rate_hz)
+        self.config = DynamixelConfig({"arm": BusConfig("emulator")}, entries, gaze=self.table, rate_hz=rate_hz)
         limits = list(zip(robot.lower.tolist(), robot.upper.tolist(), strict=True))
         self.gaze = Gaze(self.table, robot.joints, limits, self.clock)
         self.model = HandModel(robot, predict, self.clock)

@@ -10,8 +10,8 @@ from spoilt_messages import Fault, Planned
 from virtual_link import VirtualLink, at_once
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.emulator.node import Node
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.interfaces.records import JointReading
 

@@ -10,7 +10,7 @@ from typing import Any
 from virtual_port import VirtualClock, VirtualPort, at_once
 from wire_faults import Planned
 
-from bodyschema.drivers.bench.chain import ServoChain
+from bodyschema.drivers.emulator.chain import ServoChain
 from bodyschema.drivers.servos.config import ServosConfig
 from bodyschema.drivers.servos.joints import ServoJoints
 
@@ -63,7 +63,7 @@ class ServoArm:
         return tuple(kind(name, k, model) for k, (name, model) in enumerate(fitted, 1))
 
     def driven(self, driver: Callable[..., ServoJoints], config: ServosConfig[Any], **settings: Any) -> None:
-        """Put `driver` before the bench."""
+        """Put `driver` before the emulator."""
         opened = self.port, self._latency_s / 2
         self.joints = driver(config, self.names, self.clock, open_port=lambda *_: opened, **settings)
 

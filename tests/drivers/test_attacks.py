@@ -8,25 +8,25 @@ from random import Random
 from typing import Any
 
 import pytest
-from bench_arm import Arm
+from emulated_arm import Arm
 from feetech_arm import FeetechArm
 from servo_arm import TICK
 from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.wiring.servos import SCANNERS
-from bodyschema.drivers.bench.device import AnswerOnlyDevice, Device, Reply
-from bodyschema.drivers.dynamixel.bench.arm import swapped
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import Bus
+from bodyschema.drivers.dynamixel.emulator.arm import swapped
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import AnswerOnlyDevice, Device, Reply
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import Bus as FeetechBus
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
+from bodyschema.drivers.servos.eeprom_editor import EepromEditor
 from bodyschema.drivers.servos.scan import scan_port
-from bodyschema.drivers.servos.workbench import EepromEditor
 from bodyschema.interfaces.errors import SourceLost
 
 Change = Callable[[bytes, list[Reply], float], list[Reply]]
@@ -83,9 +83,9 @@ def test_a_scan_through_an_echo_finds_the_servos() -> None:
 
 def test_echo_is_not_taken_for_a_servo() -> None:
     clock, chain = VirtualClock(), Chain([Servo(BY_NAME["MX-28"], 1, lambda _: 0.0)])
-    with EepromEditor(DYNAMIXEL, clock, lambda _, baud: (VirtualPort(Wire(chain, echo), clock, baud), 0.0)) as bench:
-        bus = bench.bus("bench", 1_000_000)
-        assert [bench.is_taken(bus, id) for id in (1, 2)] == [True, False]
+    with EepromEditor(DYNAMIXEL, clock, lambda _, baud: (VirtualPort(Wire(chain, echo), clock, baud), 0.0)) as emulator:
+        bus = emulator.bus("emulator", 1_000_000)
+        assert [emulator.is_taken(bus, id) for id in (1, 2)] == [True, False]
 
 
 @pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from bodyschema.drivers import checks
-from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.drivers.bench.faults import FaultSpec
 from bodyschema.drivers.checks import Check, holders, port_checks
-from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.arm import DynamixelArm
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
-from bodyschema.drivers.feetech.bench.arm import FeetechArm
+from bodyschema.drivers.emulator.dry_run import DryRun
+from bodyschema.drivers.emulator.faults import FaultSpec
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.emulator.arm import FeetechArm
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.servos.checks import servo_checks
 from bodyschema.drivers.servos.joints import open_serial
@@ -31,7 +31,7 @@ FEETECH_CONFIG = FeetechConfig(
     {"arm": FeetechBus("elsewhere", latency_ms=20.0)},
     (ServoConfig("waist", 1, "STS3215"), ServoConfig("elbow", 2, "SCS0009")),
 )
-# Of each make: how to build its bench, how to open it, the model at the elbow, and how an
+# Of each make: how to build its emulator, how to open it, the model at the elbow, and how an
 # overloaded servo is fixed.
 MAKES = {
     "Dynamixel": (
@@ -102,7 +102,7 @@ def test_the_running_sampler_may_have_the_port(machine) -> None:
 
 
 def test_pseudo_terminal_master_does_not_count_as_holder(machine) -> None:
-    machine.process(1, "bench", "/dev/ptmx", "/dev/pts/7")
+    machine.process(1, "emulator", "/dev/ptmx", "/dev/pts/7")
     machine.process(2, "reader", "/dev/pts/7")
     assert [holder.pid for holder in holders("/dev/pts/7", machine.root)] == [2]
 
@@ -148,8 +148,8 @@ class Told:
         arm_of, config, the_make, open_port, *_ = MAKES[make]
         asked = [FaultSpec.parsed(fault, JOINTS, arm_of.kinds) for fault in faults]
         self.arm = arm_of(config, dict.fromkeys(JOINTS, lambda _: 0.2), faults=asked, return_delay_s=delay_s)
-        with DryRun(self.arm, {"arm": tmp_path / "bus"}) as bench:
-            self.checks = list(servo_checks(the_make, bench.config, SystemClock(), open_port, read_s=read_s))
+        with DryRun(self.arm, {"arm": tmp_path / "bus"}) as emulator:
+            self.checks = list(servo_checks(the_make, emulator.config, SystemClock(), open_port, read_s=read_s))
 
     def of(self, subject: str) -> list[Check]:
         return [check for check in self.checks if check.subject == subject]
@@ -158,7 +158,7 @@ class Told:
 @EACH
 def test_healthy_servos_are_reported_with_their_rate(make, tmp_path) -> None:
     told = Told(make, tmp_path)
-    if told.of("rate")[0].state == "wrong":  # on a full machine the bench may not answer in so short a time
+    if told.of("rate")[0].state == "wrong":  # on a full machine the emulator may not answer in so short a time
         told = Told(make, tmp_path, read_s=20.0)
     assert told.of("servos") == [Check("servos", "ok", "all 2 answer, each of the model that robot.toml names")]
     assert "readings/s are possible (250 wanted)" in told.of("rate")[0].said

@@ -14,8 +14,8 @@ import zenoh
 from ros2_robot import PATHS
 
 from bodyschema.drivers.ros2 import rmw
-from bodyschema.drivers.ros2.bench.node import Node
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.emulator.node import Node
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.messages import JOINT_STATE, Header, JointState, decode_joint_state, encode_joint_state
 from bodyschema.effects import Effect, Simulation

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.dynamixel.bench.frames import status_packet
 from bodyschema.drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
+from bodyschema.drivers.dynamixel.emulator.frames import status_packet
 from bodyschema.drivers.dynamixel.joints import Channel
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.packets import Status

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.faults import corrupt
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.frames import fast_block, fast_header, instructions_in, status_packet
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.crc16 import crc16
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.frames import fast_block, fast_header, instructions_in, status_packet
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.models import BY_NAME, MODELS, baud_of, baud_value
 from bodyschema.drivers.dynamixel.packets import PACKETS1, PACKETS2, Garbled, packets_of
+from bodyschema.drivers.emulator.device import Reply
+from bodyschema.drivers.emulator.faults import corrupt
 
 HEADERS = st.sampled_from([b"\xff\xff\xfd\x00", b"\xff\xff\xfd", b"\xff\xff", b"\xfd"])
 NOISE = st.lists(st.one_of(st.binary(max_size=12), HEADERS)).map(b"".join)
@@ -76,7 +76,7 @@ def test_fast_answer_is_split_or_refused_when_corrupt(blocks, draw) -> None:
 
 
 @given(st.integers(0, 252), st.integers(0, 600), NOISE.filter(bool))
-def test_bench_parses_any_write_instruction(id, address, data) -> None:
+def test_emulator_parses_any_write_instruction(id, address, data) -> None:
     found, done = instructions_in(bytearray(PACKETS2.write(id, address, data[:60])))
     assert [(i.id, i.code, i.params, i.intact) for i in found] == [
         (id, 3, address.to_bytes(2, "little") + data[:60], True)
@@ -85,7 +85,7 @@ def test_bench_parses_any_write_instruction(id, address, data) -> None:
 
 
 @given(st.lists(NOISE, max_size=5))
-def test_the_bench_survives_any_bytes(chunks) -> None:
+def test_emulator_survives_any_bytes(chunks) -> None:
     chain = Chain([Servo(BY_NAME["XM430-W350"], 1, lambda t: 0.0), Servo(BY_NAME["AX-12A"], 2, lambda t: 0.0)])
     for k, chunk in enumerate(chunks):
         chain.send(chunk, k * 1e-3, 1_000_000)
@@ -94,7 +94,7 @@ def test_the_bench_survives_any_bytes(chunks) -> None:
 
 
 @given(NOISE.filter(lambda noise: not noise.endswith((b"\xff", b"\xfd"))))
-def test_the_bench_finds_an_instruction_after_noise(noise) -> None:
+def test_emulator_finds_an_instruction_after_noise(noise) -> None:
     chain = Chain([Servo(BY_NAME["XM430-W350"], 1, lambda t: 0.0)])
     chain.send(noise, 0.0, 1_000_000)
     assert chain.send(PACKETS2.read(1, 132, 4), 1.0, 1_000_000)

@@ -9,18 +9,18 @@ from random import Random
 
 import numpy as np
 import pytest
-from bench_arm import Arm
+from emulated_arm import Arm
 from servo_arm import TICK, swing
 from virtual_port import VirtualClock, VirtualPort
 from wire_faults import storm
 
-from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.dynamixel.bench.arm import swapped
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.arm import swapped
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.emulator.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import JointReading
 
@@ -159,7 +159,7 @@ def test_missing_and_wrong_servos_share_one_table() -> None:
     with pytest.raises(SourceError) as refusal, arm.joints:
         pass
     assert str(refusal.value).splitlines()[:-1] == [
-        "the servos on bench are not those of robot.toml:",
+        "the servos on emulator are not those of robot.toml:",
         "  joint   ID  expected    found",
         "  joint1  1   XM430-W350  XM430-W350",
         "  joint2  2   XM430-W350  no answer",

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from servo_arm import swing
 
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.emulator.pty_shell import PtyShell
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import JointReading
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from test_dynamixel_bus import TalkingPort
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.feetech.bench.arm import Chain, Code, instructions_in, summed
-from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
+from bodyschema.drivers.feetech.emulator.arm import Chain, Code, instructions_in, summed
+from bodyschema.drivers.feetech.emulator.servo import CALIBRATE, Servo
 from bodyschema.drivers.feetech.joints import PACKETS, Bus, Channel
 from bodyschema.drivers.feetech.models import BY_NAME, MODELS
 from bodyschema.drivers.servos.bus import Answer, Request
@@ -74,7 +74,7 @@ def test_any_block_is_a_possible_sample_or_refused(model, size, data) -> None:
 
 
 @given(st.lists(NOISE, max_size=5))
-def test_the_bench_survives_any_bytes(chunks) -> None:
+def test_emulator_survives_any_bytes(chunks) -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], 1, lambda t: 0.0), Servo(BY_NAME["SCS0009"], 2, lambda t: 0.0)])
     for k, chunk in enumerate(chunks):
         chain.send(chunk, k * 1e-3, BAUD)
@@ -83,7 +83,7 @@ def test_the_bench_survives_any_bytes(chunks) -> None:
 
 
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=60))
-def test_bench_parses_any_write_instruction(id, address, data) -> None:
+def test_emulator_parses_any_write_instruction(id, address, data) -> None:
     found, done = instructions_in(bytearray(PACKETS.write(id, address, data)))
     assert [(i.id, i.code, i.params) for i in found] == [(id, 3, bytes((address,)) + data)]
     assert done == found[0].end

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from servo_arm import TICK, swing
 from wire_faults import storm
 
-from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.feetech.bench.arm import swapped
-from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.emulator.faults import corrupt, garbage, half, late, mute, wrong_checksum
+from bodyschema.drivers.feetech.emulator.arm import swapped
+from bodyschema.drivers.feetech.emulator.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.drivers.servos.channel import Punctuality
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -136,7 +136,7 @@ def test_missing_and_wrong_servos_share_one_table() -> None:
     with pytest.raises(SourceError) as refusal, arm.joints:
         pass
     assert str(refusal.value).splitlines()[:-1] == [
-        "the servos on bench are not those of robot.toml:",
+        "the servos on emulator are not those of robot.toml:",
         "  joint   ID  expected  found",
         "  joint1  1   STS3215   STS3215",
         "  joint2  2   STS3215   no answer",

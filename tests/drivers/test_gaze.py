@@ -12,8 +12,8 @@ import pytest
 from gazing_robot import HEAD, GazingRobot
 
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
-from bodyschema.drivers.dynamixel.bench.arm import DrivenShaft
-from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE
+from bodyschema.drivers.dynamixel.emulator.arm import DrivenShaft
+from bodyschema.drivers.dynamixel.emulator.servo import CURRENT_MODE
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.robot.description import RobotDescription
 

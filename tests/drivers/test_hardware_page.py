@@ -9,14 +9,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bodyschema.cli.hardware.bench_run import FAULTS
+from bodyschema.cli.hardware.emulator_run import FAULTS
 from bodyschema.cli.main import command_line
 from bodyschema.drivers.config import DriversConfig
-from bodyschema.drivers.dynamixel.bench.arm import KINDS as DYNAMIXEL_KINDS
+from bodyschema.drivers.dynamixel.emulator.arm import KINDS as DYNAMIXEL_KINDS
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL_MODELS
-from bodyschema.drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
+from bodyschema.drivers.feetech.emulator.arm import KINDS as FEETECH_KINDS
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from bodyschema.drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
+from bodyschema.drivers.serial_lines.emulator.arm import KINDS as LINE_KINDS
 from bodyschema.drivers.serial_lines.lines import Header, Reading, parse
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text()
@@ -54,7 +54,7 @@ def test_the_lines_that_are_shown_are_lines() -> None:
     assert parse(found[2].encode()) == Reading(12, 3456789, (1023, None))
 
 
-def test_the_bench_starts_as_shown(tmp_path, monkeypatch, capsys) -> None:
+def test_emulator_starts_as_shown(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     exec(block("python", "speak to"), {})
     assert capsys.readouterr().out == "speak to bus\n"
@@ -67,7 +67,7 @@ def test_every_command_on_the_page_is_understood(command) -> None:
     assert callable(understood)
 
 
-def test_faults_listed_are_the_benches_faults() -> None:
+def test_faults_listed_are_emulators_faults() -> None:
     assert set(FAULTS) == {kind for kinds in (DYNAMIXEL_KINDS, FEETECH_KINDS, LINE_KINDS) for kind in kinds.names}
 
 

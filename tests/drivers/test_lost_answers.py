@@ -10,21 +10,21 @@ from random import Random
 from statistics import median
 
 import pytest
-from bench_arm import Arm
+from emulated_arm import Arm
 from feetech_arm import FeetechArm
 from hypothesis import given
 from hypothesis import strategies as st
 from virtual_port import VirtualClock, VirtualPort
 from wire_faults import Planned, Storm
 
-from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.faults import mute
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import Bus
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import Reply
+from bodyschema.drivers.emulator.faults import mute
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import Bus as FeetechBus
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
 

@@ -20,8 +20,8 @@ from bodyschema.drivers.markers.natnet import packets
 from bodyschema.drivers.markers.report import Unusable
 from bodyschema.drivers.markers.stream import MarkerStream, stream_checks
 from bodyschema.drivers.ros2 import rmw
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.cdr import CdrWriter
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.messages import NANO, Header, MessageType, encode_point, encode_pose, write_header
 from bodyschema.interfaces.clock import SystemClock

@@ -11,15 +11,15 @@ import pytest
 from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.wiring.servos import SCANNERS
-from bodyschema.drivers.bench.device import AnswerOnlyDevice, Faults, Reply, no_faults
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.frames import Code, Error, instructions_in
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import LIKELY_FIRST
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.frames import Code, Error, instructions_in
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import AnswerOnlyDevice, Faults, Reply, no_faults
+from bodyschema.drivers.emulator.pty_shell import PtyShell
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FeetechPackets
 from bodyschema.drivers.feetech.models import BAUDS as FEETECH_BAUDS
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
@@ -51,7 +51,7 @@ class Cable(AnswerOnlyDevice):
         return [reply for chain in self._chains for reply in chain.send(data, t, baud)]
 
 
-class Bench:
+class Emulator:
     """Servos in virtual time."""
 
     def __init__(self, servos: Sequence[Servo | FeetechServo], faults: Faults = no_faults) -> None:
@@ -60,11 +60,11 @@ class Bench:
         self.sent = bytearray()
 
     def open(self, _port: str, baud: int, _clock: object) -> VirtualPort:
-        bench = self
+        emulator = self
 
         class Listened(VirtualPort):
             def write(self, data: bytes) -> None:
-                bench.sent += data
+                emulator.sent += data
                 super().write(data)
 
         return Listened(self.chain, self.clock, baud)
@@ -74,7 +74,7 @@ class Bench:
 
 
 def found(*servos: Servo | FeetechServo, bauds: Sequence[int] = (1_000_000,)) -> tuple[FoundServo, ...]:
-    return Bench(servos).scan(*bauds).servos
+    return Emulator(servos).scan(*bauds).servos
 
 
 def test_both_protocols_are_found_on_one_bus() -> None:
@@ -221,35 +221,37 @@ def test_xl_320_is_named_as_without_driver() -> None:
 
 
 def test_scan_writes_to_no_servo() -> None:
-    bench = Bench([servo("XM430-W350", 1), servo("MX-28", 4), feetech("STS3215", 5)])
-    bench.scan()
-    told = instructions_in(bench.sent)[0]
+    emulator = Emulator([servo("XM430-W350", 1), servo("MX-28", 4), feetech("STS3215", 5)])
+    emulator.scan()
+    told = instructions_in(emulator.sent)[0]
     assert {instruction.code for instruction in told} == {Code.PING, Code.READ}
 
 
 def test_all_rates_take_less_than_15_s() -> None:
-    bench = Bench([servo("XM430-W350", id) for id in range(1, 7)] + [feetech("STS3215", id) for id in range(11, 17)])
-    begin = bench.clock.now()
-    bench.scan()
-    assert bench.clock.now() - begin < 15.0
+    emulator = Emulator(
+        [servo("XM430-W350", id) for id in range(1, 7)] + [feetech("STS3215", id) for id in range(11, 17)]
+    )
+    begin = emulator.clock.now()
+    emulator.scan()
+    assert emulator.clock.now() - begin < 15.0
 
 
 def test_progress_is_reported_for_each_rate() -> None:
-    bench = Bench([servo("XM430-W350", 1)])
-    bench.scan(1_000_000, 57_600)
-    assert bench.said[-1] == "bus: Dynamixel 1.0 and Feetech at 57,600 bit/s; 1 servo so far"
-    assert len(bench.said) == 4
+    emulator = Emulator([servo("XM430-W350", 1)])
+    emulator.scan(1_000_000, 57_600)
+    assert emulator.said[-1] == "bus: Dynamixel 1.0 and Feetech at 57,600 bit/s; 1 servo so far"
+    assert len(emulator.said) == 4
 
 
 def test_lost_port_keeps_the_servos_found() -> None:
-    bench = Bench([servo("XM430-W350", 1)])
+    emulator = Emulator([servo("XM430-W350", 1)])
 
     def opened(port, baud, clock):
         if baud != 1_000_000:
             raise SourceError("bus is gone")
-        return bench.open(port, baud, clock)
+        return emulator.open(port, baud, clock)
 
-    told = scan_port("bus", SCANNERS, bench.clock, bench.said.append, open_port=opened)
+    told = scan_port("bus", SCANNERS, emulator.clock, emulator.said.append, open_port=opened)
     assert ([s.id for s in told.servos], told.trouble) == ([1], "bus is gone")
 
 
@@ -284,5 +286,5 @@ def test_servo_is_found_despite_one_lost_answer(lost) -> None:
     def lose(reply: Reply) -> Reply:
         return replace(reply, data=b"") if next(answers) == lost else reply
 
-    bench = Bench([servo("XM430-W350", id) for id in (1, 2, 3, 4)], lose)
-    assert [found.id for found in bench.scan(1_000_000).servos] == [1, 2, 3, 4]
+    emulator = Emulator([servo("XM430-W350", id) for id in (1, 2, 3, 4)], lose)
+    assert [found.id for found in emulator.scan(1_000_000).servos] == [1, 2, 3, 4]

@@ -14,20 +14,20 @@ import pytest
 from servo_arm import swing
 
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
-from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.config import BusConfig as DynamixelBus
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain as DynamixelChain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.arm import Chain
-from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.emulator.pty_shell import PtyShell
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig, ServoConfig
+from bodyschema.drivers.feetech.emulator.arm import Chain
+from bodyschema.drivers.feetech.emulator.servo import Servo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME
-from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.emulator.board import EncoderBoard
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -74,7 +74,7 @@ EACH = pytest.mark.parametrize("make", [dynamixel, feetech, encoders])
 
 @pytest.fixture
 def silence_is_no_loss(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bench and driver share this process: on a busy machine the bench itself may be silent for a while."""
+    """Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while."""
     monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
 
 
@@ -88,7 +88,7 @@ def wait_for_reading(source: Any) -> JointReading:
 
 @contextmanager
 def patiently(source: Any) -> Iterator[Any]:
-    """Open `source`, also where a busy machine lets the bench answer the first attempts too late."""
+    """Open `source`, also where a busy machine lets the emulator answer the first attempts too late."""
     deadline = time.monotonic() + LIMIT_S
     with ExitStack() as stack:
         opened = None
@@ -124,7 +124,7 @@ def test_unplugged_port_is_reported_once_and_recovers(make: Make, tmp_path, capl
         reconnecting = ReconnectingSource(joints, "the encoders", SystemClock())
         with caplog.at_level(logging.WARNING), patiently(reconnecting) as source:
             before = wait_for_reading(source)
-            caplog.clear()  # on a busy machine the bench may have been silent before
+            caplog.clear()  # on a busy machine the emulator may have been silent before
             losses = source.losses
             shell.unplug()
             for _ in range(20):

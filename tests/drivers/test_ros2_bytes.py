@@ -107,7 +107,7 @@ def test_message_written_by_rclpy_is_read_despite_padding() -> None:
     assert message.velocities == message.efforts == (0.0,) * 6
 
 
-def test_bench_message_matches_rosbags() -> None:
+def test_emulator_message_matches_rosbags() -> None:
     assert encode_joint_state(TWO) == ROSBAGS_LITTLE
     assert encode_joint_state(TWO, big_endian=True) == ROSBAGS_BIG
     assert encode_joint_state(GERMAN) == ROSBAGS_GERMAN

@@ -7,8 +7,8 @@ from ros2_robot import PATHS, Robot
 from spoilt_messages import Fault
 
 from bodyschema.drivers.checks import Check
-from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.emulator.node import Node
 from bodyschema.drivers.ros2.joints import joint_state_checks
 from bodyschema.interfaces.errors import SourceLost
 

@@ -11,7 +11,7 @@ from ros2_robot import PATHS, Robot
 from spoilt_messages import Fault
 
 from bodyschema.drivers.ros2 import rmw
-from bodyschema.drivers.ros2.bench.node import Node
+from bodyschema.drivers.ros2.emulator.node import Node
 from bodyschema.drivers.ros2.link import Sample
 from bodyschema.drivers.ros2.messages import JOINT_STATE, POINT_STAMPED, Header, JointState, encode_joint_state
 from bodyschema.drivers.ros2.senders import Refusal

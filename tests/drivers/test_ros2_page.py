@@ -48,6 +48,6 @@ def test_there_are_messages_explained() -> None:
     assert len(MESSAGES) > 5
 
 
-def test_the_bench_starts_as_shown(capsys) -> None:
+def test_emulator_starts_as_shown(capsys) -> None:
     exec(block("python"), {})
     assert "router and robot at" in capsys.readouterr().out

@@ -11,9 +11,9 @@ import zenoh
 from ros2_robot import PATHS
 
 from bodyschema.drivers.ros2 import rmw
-from bodyschema.drivers.ros2.bench.node import EPOCH_NS, Node
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.config import MarkerTopic, Ros2Config
+from bodyschema.drivers.ros2.emulator.node import EPOCH_NS, Node
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.marker import MarkerPublisher

@@ -12,18 +12,18 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from bench_arm import Arm
+from emulated_arm import Arm
 from feetech_arm import FeetechArm
 from free_ports import free_endpoint
 from servo_arm import TICK
 from test_serial_lines import BoardArm
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.bench.device import Angle
-from bodyschema.drivers.bench.servo_arm import played
-from bodyschema.drivers.ros2.bench.node import Node
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.emulator.device import Angle
+from bodyschema.drivers.emulator.servo_arm import played
 from bodyschema.drivers.ros2.config import Ros2Config
+from bodyschema.drivers.ros2.emulator.node import Node
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.drivers.ros2.link import Link, Sample, open_zenoh
 from bodyschema.interfaces.protocols import JointSource
@@ -121,7 +121,7 @@ def simulated(arm: Guided) -> Iterator[tuple[JointSource, float]]:
         yield world.joints, 1 / CONFIG.encoders.rate_hz
 
 
-def on_bench(make: Callable[..., Arm | FeetechArm | BoardArm], **more: object):
+def on_emulator(make: Callable[..., Arm | FeetechArm | BoardArm], **more: object):
     @contextmanager
     def opened(arm: Guided) -> Iterator[tuple[JointSource, float]]:
         settings = {"paths": arm.angles(BEGIN_S), "limits": arm.limits, "latency_s": LATENCY_S, "rate_hz": RATE_HZ}
@@ -132,10 +132,10 @@ def on_bench(make: Callable[..., Arm | FeetechArm | BoardArm], **more: object):
 
 SOURCES = {
     "simulated source": simulated,
-    "Dynamixel 2.0": on_bench(Arm, models=("XM430-W350",) * 4),
-    "Dynamixel 1.0": on_bench(Arm, models=("MX-28",) * 4),
-    "Feetech": on_bench(FeetechArm, models=("STS3215",) * 4),
-    "serial lines": on_bench(BoardArm),
+    "Dynamixel 2.0": on_emulator(Arm, models=("XM430-W350",) * 4),
+    "Dynamixel 1.0": on_emulator(Arm, models=("MX-28",) * 4),
+    "Feetech": on_emulator(FeetechArm, models=("STS3215",) * 4),
+    "serial lines": on_emulator(BoardArm),
     "ROS 2": ros2,
 }
 

@@ -1,4 +1,4 @@
-"""Own encoders: lines, the driver over its bench in virtual time, and the sketch for a real board."""
+"""Own encoders: lines, the driver over its emulator in virtual time, and the sketch for a real board."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from servo_arm import swing
 from virtual_port import VirtualClock, VirtualPort, at_once
 from wire_faults import Planned, storm
 
-from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
+from bodyschema.drivers.emulator.device import Reply
+from bodyschema.drivers.emulator.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from bodyschema.drivers.serial_lines.board import Board
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.emulator.board import EncoderBoard
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.drivers.serial_lines.lines import (
     INITIAL,
@@ -84,7 +84,7 @@ class BoardArm:
         self.port = VirtualPort(self.board, self.clock, baud, inwards=jitter)
         entries = tuple(EncoderConfig(name, **encoders) for name in self.names)  # pyright: ignore[reportArgumentType]
         self.joints = SerialLineJoints(
-            SerialLinesConfig("bench", entries, baud, **settings),
+            SerialLinesConfig("emulator", entries, baud, **settings),
             self.names,
             self.clock,
             limits=[(-2.0, 2.0)] * len(self.paths) if limits is None else limits,
@@ -273,7 +273,7 @@ def test_missing_and_mismatched_encoders_share_one_table() -> None:
     with pytest.raises(SourceError) as refusal, arm.joints:
         pass
     assert str(refusal.value).splitlines() == [
-        "the encoders on bench are not those of robot.toml:",
+        "the encoders on emulator are not those of robot.toml:",
         "  joint   encoder  expected    found",
         "  joint1  joint1   4096 ticks  4096 ticks",
         "  joint2  joint2   4096 ticks  1024 ticks",

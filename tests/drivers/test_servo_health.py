@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import pytest
-from bench_arm import Arm
+from emulated_arm import Arm
 from feetech_arm import FeetechArm
 from servo_arm import swing
 
-from bodyschema.drivers.dynamixel.bench.servo import Servo
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.interfaces.errors import SourceError, SourceLost
 
 MAKES = [Arm, FeetechArm]

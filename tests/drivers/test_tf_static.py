@@ -12,8 +12,8 @@ import zenoh.ext
 from ros2_robot import PATHS
 
 from bodyschema.drivers.ros2 import rmw
-from bodyschema.drivers.ros2.bench.node import Node
-from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+from bodyschema.drivers.ros2.emulator.node import Node
+from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.link import open_session
 from bodyschema.drivers.ros2.messages import TF_MESSAGE, Header, encode_transform
 from bodyschema.robot.hand_eye import HandEye

@@ -11,15 +11,15 @@ import pytest
 from floating_arm import CONSTANT, INERTIA, WEIGHT_N_M, FloatingArm, holding
 from virtual_port import VirtualClock, VirtualPort
 
-from bodyschema.drivers.bench.faults import mute
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.frames import Code
-from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.frames import Code
+from bodyschema.drivers.dynamixel.emulator.servo import CURRENT_MODE, POSITION_MODE, Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
+from bodyschema.drivers.emulator.faults import mute
 from bodyschema.interfaces.errors import RequestError, SourceError, SourceLost
 
 DRIFT_RAD = math.radians(0.5)  # allowed drift of the arm in ten seconds after its release

@@ -14,8 +14,8 @@ from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_drives
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME, TORQUE_AT_CURRENT
 

@@ -17,9 +17,9 @@ import warm
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_joints
-from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
-from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, POSITION_MODE
+from bodyschema.drivers.dynamixel.emulator.arm import DynamixelArm
+from bodyschema.drivers.dynamixel.emulator.servo import CURRENT_MODE, POSITION_MODE
+from bodyschema.drivers.emulator.dry_run import DryRun
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 
@@ -70,21 +70,21 @@ def write_robot(folder: Path, *, hold: str = "zero_force", tables: str = ZERO_FO
 
 
 @contextmanager
-def bench_of(file: Path, mode: int = CURRENT_MODE) -> Iterator[DryRun]:
+def emulator_of(file: Path, mode: int = CURRENT_MODE) -> Iterator[DryRun]:
     config = Config.load(file).tables.drivers.dynamixel
     assert config is not None
     angles = {joint: lambda _, q=q: q for joint, q in ANGLES.items()}
-    with DryRun(DynamixelArm(config, angles), {"arm": file.parent / "bus"}) as bench:
+    with DryRun(DynamixelArm(config, angles), {"arm": file.parent / "bus"}) as emulator:
         for joint in ANGLES:
-            servo = bench.arm.servo(joint)
+            servo = emulator.arm.servo(joint)
             servo["operating_mode"], servo["goal_current"] = mode, servo["current_limit"]
-        yield bench
+        yield emulator
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[DryRun]:
-    with bench_of(write_robot(tmp_path)) as bench:
-        yield bench
+def emulator(tmp_path: Path) -> Iterator[DryRun]:
+    with emulator_of(write_robot(tmp_path)) as emulator:
+        yield emulator
 
 
 class Floating:
@@ -127,9 +127,9 @@ class Floating:
 
 
 @pytest.fixture
-def floating(bench: DryRun, tmp_path: Path) -> Iterator[Floating]:
+def floating(emulator: DryRun, tmp_path: Path) -> Iterator[Floating]:
     def begun(said: dict) -> bool:
-        return min(map(abs, currents(bench, 0.0))) > 0.1 or has_ended(said)
+        return min(map(abs, currents(emulator, 0.0))) > 0.1 or has_ended(said)
 
     # On a full machine a heartbeat may come too late for the servos, which end it as they should: begin again.
     for _ in range(5):
@@ -144,50 +144,50 @@ def has_ended(said: dict) -> bool:
     return any("zero_force ended" in text for text in said["health"])
 
 
-def torque(bench: DryRun) -> list[int]:
-    return [bench.arm.servo(joint)["torque"] for joint in ANGLES]
+def torque(emulator: DryRun) -> list[int]:
+    return [emulator.arm.servo(joint)["torque"] for joint in ANGLES]
 
 
-def currents(bench: DryRun, after_s: float) -> list[float]:
-    return [bench.arm.servo(joint).motor_current(time.monotonic() + after_s) for joint in ANGLES]
+def currents(emulator: DryRun, after_s: float) -> list[float]:
+    return [emulator.arm.servo(joint).motor_current(time.monotonic() + after_s) for joint in ANGLES]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it_with_torque_off(bench, floating, number) -> None:
+def test_a_signal_ends_it_with_torque_off(emulator, floating, number) -> None:
     floating.process.send_signal(number)
     assert floating.ended() == 0
-    assert torque(bench) == [0, 0]
+    assert torque(emulator) == [0, 0]
 
 
-def test_killed_process_leaves_no_current_after_heartbeat(bench, floating) -> None:
+def test_killed_process_leaves_no_current_after_heartbeat(emulator, floating) -> None:
     floating.process.kill()
     floating.ended()
-    assert not any(currents(bench, HEARTBEAT_S + 0.02))
-    assert [bench.arm.servo(joint)["watchdog"] for joint in ANGLES] == [-1, -1]
+    assert not any(currents(emulator, HEARTBEAT_S + 0.02))
+    assert [emulator.arm.servo(joint)["watchdog"] for joint in ANGLES] == [-1, -1]
 
 
-def test_unplugged_bus_loses_current_and_torque_stays_off(bench, floating) -> None:
-    bench.shells["arm"].unplug()
-    assert not any(currents(bench, HEARTBEAT_S + 0.02))
-    bench.shells["arm"].plug_in()
-    said = floating.until(lambda said: said["trouble"] is None and torque(bench) == [0, 0] and said["health"])
+def test_unplugged_bus_loses_current_and_torque_stays_off(emulator, floating) -> None:
+    emulator.shells["arm"].unplug()
+    assert not any(currents(emulator, HEARTBEAT_S + 0.02))
+    emulator.shells["arm"].plug_in()
+    said = floating.until(lambda said: said["trouble"] is None and torque(emulator) == [0, 0] and said["health"])
     assert "zero_force ended, torque off" in said["health"][0]
     assert "bodyschema command zero_force_on" in said["health"][0]
 
 
-def test_a_fault_of_a_servo_ends_it(bench, floating) -> None:
-    bench.arm.servo("elbow").fail(0x20)
+def test_a_fault_of_a_servo_ends_it(emulator, floating) -> None:
+    emulator.arm.servo("elbow").fail(0x20)
     said = floating.until(has_ended)
-    assert torque(bench) == [0, 0]
+    assert torque(emulator) == [0, 0]
     assert floating.process.poll() is None
     assert any("'elbow'" in text for text in said["health"])
 
 
 def test_another_mode_is_refused_with_the_command(tmp_path) -> None:
-    with bench_of(write_robot(tmp_path), POSITION_MODE) as bench, Floating(tmp_path) as floating:
+    with emulator_of(write_robot(tmp_path), POSITION_MODE) as emulator, Floating(tmp_path) as floating:
         assert floating.ended() == 1
         assert "bodyschema servos operating_mode=0 --joint shoulder" in " ".join(floating.errors().split())
-        assert torque(bench) == [0, 0]
+        assert torque(emulator) == [0, 0]
 
 
 # --- requirements on robot.toml
@@ -211,7 +211,7 @@ def test_a_urdf_without_masses_is_refused(tmp_path) -> None:
         open_joints(Config.load(write_robot(tmp_path, inertial="")), SystemClock())
 
 
-def test_currents_bear_the_weight_stated_in_urdf(bench, floating) -> None:
+def test_currents_bear_the_weight_stated_in_urdf(emulator, floating) -> None:
     floating.until(lambda _: True)
     g, mass, lever, length = 9.80665, 0.5, 0.15, 0.3
     q1, q2 = ANGLES.values()
@@ -219,4 +219,4 @@ def test_currents_bear_the_weight_stated_in_urdf(bench, floating) -> None:
     shoulder = elbow + mass * g * (lever + length) * math.cos(q1)
     # A turn about y lowers the parts in front, so the holding torque is negative.
     expected = [-torque / (4.1 / 2.3) for torque in (shoulder, elbow)]
-    assert currents(bench, 0.0) == pytest.approx(expected, abs=0.01)
+    assert currents(emulator, 0.0) == pytest.approx(expected, abs=0.01)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from random import Random
 
-from bodyschema.drivers.bench.device import Fault, Reply
-from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
+from bodyschema.drivers.emulator.device import Fault, Reply
+from bodyschema.drivers.emulator.faults import corrupt, garbage, half, late, mute, wrong_checksum
 
 
 class Planned:

@@ -10,8 +10,8 @@ import numpy as np
 from virtual_port import VirtualClock, VirtualPort
 
 from bodyschema.daemon.config import Config
-from bodyschema.drivers.feetech.bench.arm import Chain
-from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.feetech.emulator.arm import Chain
+from bodyschema.drivers.feetech.emulator.servo import Servo
 from bodyschema.drivers.feetech.joints import FeetechJoints
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.interfaces.records import FloatArray

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typed_pages import command_of
 
-from bodyschema.cli.hardware.bench_run import BenchRun
+from bodyschema.cli.hardware.emulator_run import EmulatorRun
 from bodyschema.cli.main import COMMANDS, RENAMED, command_line
 from bodyschema.daemon.config import Config
 
@@ -50,7 +50,7 @@ def test_every_command_in_the_readme_is_understood(command: str) -> None:
 @pytest.mark.usefixtures("patient_host")
 def test_real_arm_commands_work_on_emulated_servos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Run the README's commands on an emulated arm: the port and one baud rate are given, and there are no prompts."""
-    with BenchRun(Config.load(ROOT / "examples" / "desk_arm" / "servos.toml", {}), tmp_path / "bus") as run:
+    with EmulatorRun(Config.load(ROOT / "examples" / "desk_arm" / "servos.toml", {}), tmp_path / "bus") as run:
         port = ["--port", str(tmp_path / "bus"), "--baud", "1000000"]
         urdf, robot = str(ROOT / "examples" / "desk_arm" / "desk_arm.urdf"), str(tmp_path / "robot.toml")
         for words in (

@@ -31,7 +31,7 @@ device urandom 1 9
 device tty 5 0
 device ptmx 5 2
 mkdir pts shm
-mount --bind /dev/pts pts # the bench of a test opens pseudo terminals there
+mount --bind /dev/pts pts # the emulator of a test opens pseudo terminals there
 mount -t tmpfs -o mode=1777 tmpfs shm
 ln -s /proc/self/fd fd
 cd /

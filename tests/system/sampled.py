@@ -20,8 +20,8 @@ from bodyschema.daemon.transport.keys import CommandName, Keys
 from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
-from bodyschema.daemon.wiring.bench import Motion, bench_robot_file, open_bench
-from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.daemon.wiring.emulators import Motion, emulator_robot_file, open_emulator
+from bodyschema.drivers.emulator.dry_run import DryRun
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.recordings.store.store import PairReader
@@ -66,13 +66,13 @@ def eyes_at(config: Config, x: FloatArray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @contextlib.contextmanager
-def on_the_bench(config: Config, folder: Path, angle: Callable[[float], FloatArray]) -> Iterator[tuple[Config, DryRun]]:
+def on_emulator(config: Config, folder: Path, angle: Callable[[float], FloatArray]) -> Iterator[tuple[Config, DryRun]]:
     """Yield the same arm with emulated servos moving along `angle`, and the emulator."""
     motion = {name: lambda t, j=j: float(angle(t)[j]) for j, name in enumerate(config.robot.joints)}
-    bench = open_bench(config, folder / "bus", Motion(motion, "test"), return_delay_s=0.0, seed=0)
-    file = bench_robot_file(config, bench, folder / "bus")
-    with bench:
-        yield Config.load(file, {}), bench
+    emulator = open_emulator(config, folder / "bus", Motion(motion, "test"), return_delay_s=0.0, seed=0)
+    file = emulator_robot_file(config, emulator, folder / "bus")
+    with emulator:
+        yield Config.load(file, {}), emulator
 
 
 class SamplerProcess:

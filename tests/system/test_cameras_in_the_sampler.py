@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from sampled import LIMIT_S, drawn, on_the_bench, pairs_of, sampling, until
+from sampled import LIMIT_S, drawn, on_emulator, pairs_of, sampling, until
 from v4l2_cameras import ShimCamera, preloaded
 
 from bodyschema.daemon.config import Config
@@ -68,8 +68,8 @@ def moving(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[C
     """Yield a moving arm, and a stereo camera that sees it as it was 70 ms before each time stamp."""
     device = tmp_path / "dev" / "usb-Stereo_1234-video-index0"
     config = write_arm(tmp_path, free_endpoint, CAMERA.format(device=device, latency=LATENCY_S))
-    with ShimCamera(device, film(), fps=FPS) as camera, on_the_bench(config, tmp_path, angles) as (benched, _):
-        yield benched, camera
+    with ShimCamera(device, film(), fps=FPS) as camera, on_emulator(config, tmp_path, angles) as (emulated, _):
+        yield emulated, camera
 
 
 @pytest.mark.soak  # with images in a folder: below; cameras below OpenCV: test_v4l2; latency_s: test_cameras
@@ -125,7 +125,7 @@ def test_servos_and_images_in_a_folder_give_pairs(tmp_path, free_endpoint) -> No
         cv2.imwrite(str(tmp_path / f"{eye}_0.png"), image)
         for number in range(1, len(times)):
             (tmp_path / f"{eye}_{number}.png").symlink_to(tmp_path / f"{eye}_0.png")
-    with on_the_bench(config, tmp_path, lambda t: MIDDLE) as (benched, _), sampling(benched) as sampler:
+    with on_emulator(config, tmp_path, lambda t: MIDDLE) as (emulated, _), sampling(emulated) as sampler:
         until(sampler, lambda said: said.pairs >= 2)
-    x = np.array([pair.x for pair in pairs_of(benched)])
+    x = np.array([pair.x for pair in pairs_of(emulated)])
     assert np.abs(x - config.robot.chain.positions(MIDDLE[None])).max() < 3e-3

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sampled import LIMIT_S, SamplerProcess, drawn, on_the_bench, pairs_of, sampling, until
+from sampled import LIMIT_S, SamplerProcess, drawn, on_emulator, pairs_of, sampling, until
 from v4l2_cameras import LiveCamera, preloaded
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import demonstration_model
-from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.emulator.dry_run import DryRun
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
@@ -137,9 +137,9 @@ class Episode:
 class Stage:
     """An arm with an emulated head, and the cameras that the head carries."""
 
-    def __init__(self, config: Config, bench: DryRun, guided: Guided) -> None:
-        self.config, self._bench, self._guided = config, bench, guided
-        self.head = [bench.arm.servo(joint) for joint in config.robot.joints[:2]]
+    def __init__(self, config: Config, emulator: DryRun, guided: Guided) -> None:
+        self.config, self._emulator, self._guided = config, emulator, guided
+        self.head = [emulator.arm.servo(joint) for joint in config.robot.joints[:2]]
 
     def q(self, t: float) -> FloatArray:
         """Return the joint positions [rad] (d,)."""
@@ -154,7 +154,7 @@ class Stage:
     @property
     def torque(self) -> tuple[int, ...]:
         """Torque register of each servo."""
-        return tuple(self._bench.arm.servo(joint)["torque"] for joint in self.config.robot.joints)
+        return tuple(self._emulator.arm.servo(joint)["torque"] for joint in self.config.robot.joints)
 
     def watch(self, sampler: SamplerProcess, seconds: float, pairs: int = 0) -> Watched:
         """Observe for at least this time and this many pairs."""
@@ -188,11 +188,11 @@ def episode(library, tmp_path_factory, free_endpoint) -> Episode:
     device = folder / "dev" / "usb-Stereo_1234-video-index0"
     config = write_robot(folder, free_endpoint, device)
     guided = Guided(looking_at_the_hand(config.robot))
-    with on_the_bench(config, folder, guided) as (benched, bench):
-        stage = Stage(benched, bench, guided)
+    with on_emulator(config, folder, guided) as (emulated, emulator):
+        stage = Stage(emulated, emulator, guided)
         with (
             LiveCamera(device, GREY, stage.seen, fps=FPS, latency_s=LATENCY_S),
-            sampling(benched, preloaded(library)) as sampler,
+            sampling(emulated, preloaded(library)) as sampler,
         ):
             until(sampler, lambda said: said.pairs >= 1)
             guided.begin_s = time.monotonic()

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from board_renderer import Photographer, Printed, Taken, TrueLens, TrueRig, poses
-from sampled import LIMIT_S, on_the_bench
+from sampled import LIMIT_S, on_emulator
 from v4l2_cameras import LiveCamera, preloaded
 
 from bodyschema.daemon.config import Config
@@ -125,15 +125,15 @@ def test_one_webcam_is_calibrated_and_its_arm_learnt(library, tmp_path, free_end
     chain = config.robot.with_placement(BASE_TO_CAMERA, np.array([0.01, -0.01, 0.03])).chain
     world = World(chain, boards(30))
     with (
-        on_the_bench(config, tmp_path, guided) as (benched, _),
+        on_emulator(config, tmp_path, guided) as (emulated, _),
         LiveCamera(device, np.full((*SIZE_PX[::-1], 3), 128, np.uint8), world.seen, fps=FPS, latency_s=LATENCY_S),
     ):
-        robot = ("--robot", benched.file)
+        robot = ("--robot", emulated.file)
         calibrated = json.loads(type_("calibrate", "cameras", *robot, "--json"))
         assert len(calibrated["views"]) >= 20
         world.shows_board = False
         found = type_("calibrate", "latency", *robot, "--seconds", 12, "--write")
-        cameras = Config.load(benched.file, {}).tables.vision.cameras
+        cameras = Config.load(emulated.file, {}).tables.vision.cameras
         assert cameras is not None
         assert cameras.latency_s == pytest.approx(LATENCY_S, abs=0.005), found
         running = subprocess.Popen([sys.executable, "-m", "bodyschema", "run", *map(str, robot)], env=environment)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from own_systemd import Machine, missing_here
-from sampled import drawn, on_the_bench
+from sampled import drawn, on_emulator
 from security_recipe import SEVERAL, carried_out
 from small_arm import write_small_arm
 from test_cameras_in_the_sampler import CAMERA, MIDDLE, write_arm
@@ -250,14 +250,14 @@ def test_servos_and_a_camera_give_pairs(machine, tmp_path, library) -> None:
     tables = CAMERA.format(device=CAMERA_FILE, latency=0.0)
     config = write_arm(tmp_path, lambda: f"tcp/127.0.0.1:{next(ports)}", tables, "[daemon]\nany_step = true\n")
     camera = ShimCamera(tmp_path / "camera", [np.hstack(drawn(config, MIDDLE))])
-    with camera, on_the_bench(config, tmp_path, lambda t: MIDDLE) as (benched, _):
-        for device, group in ((configured_ports(benched)["arm"], "dialout"), (camera.file, "video")):
+    with camera, on_emulator(config, tmp_path, lambda t: MIDDLE) as (emulated, _):
+        for device, group in ((configured_ports(emulated)["arm"], "dialout"), (camera.file, "video")):
             shutil.chown(os.path.realpath(device), group=group)
             os.chmod(os.path.realpath(device), 0o660)
         place = f"mkdir -p {Path(CAMERA_FILE).parent} && touch {CAMERA_FILE}"
         machine.run("sh", "-c", f"{place} && mount --bind {camera.file} {CAMERA_FILE}")
-        install(machine, "service", "--robot", benched.file, "--only", "sampler")
-        unit = f"bodyschema-sampler@{benched.robot.name}.service"
+        install(machine, "service", "--robot", emulated.file, "--only", "sampler")
+        unit = f"bodyschema-sampler@{emulated.robot.name}.service"
         # The camera is a library below OpenCV: it takes the place of V4L2.
         machine.drop_in(unit, f"[Service]\nEnvironment=LD_PRELOAD={library}\nBindReadOnlyPaths={library.parent}\n")
         machine.systemctl("start", unit)

@@ -83,8 +83,8 @@ def servos(
     selected = _selected_servos(robot, joint, bus, port, id, baud)
     if assigned:
         log = _log(robot, port)
-        with _workbench(selected) as workbench:
-            _carry_out(workbench, plan(workbench, selected, assigned), log, dry_run=dry_run, yes=yes)
+        with _editor(selected) as editor:
+            _carry_out(editor, plan(editor, selected, assigned), log, dry_run=dry_run, yes=yes)
     else:
         _show(selected, as_json=as_json)
 
@@ -94,12 +94,12 @@ def _show(selected: Sequence[SelectedServo], *, as_json: bool) -> None:
     from bodyschema.daemon.wiring.eeprom import settings_by_name
 
     found = []
-    with _workbench(selected) as workbench:
+    with _editor(selected) as editor:
         for one in selected:
-            at = workbench.bus(one.port, one.baud)
-            servo = workbench.identified_servo(at, one.entry, one.model)
-            settings = settings_by_name(workbench, one.model).values()
-            found.append((servo, [(setting, workbench.value(at, servo, setting)) for setting in settings]))
+            at = editor.bus(one.port, one.baud)
+            servo = editor.identified_servo(at, one.entry, one.model)
+            settings = settings_by_name(editor, one.model).values()
+            found.append((servo, [(setting, editor.value(at, servo, setting)) for setting in settings]))
             if not as_json:
                 Console(highlight=False).print(settings_table(*found[-1]))
     if as_json:
@@ -112,17 +112,17 @@ def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool,
     if not joint:
         raise ConfigError("no joint is named", remedy="Name it with --joint")
     selected = _selected_servos(robot, joint, None, None, None, RATE)
-    with _workbench(selected) as workbench:
+    with _editor(selected) as editor:
         if in_servo:
-            _carry_out(workbench, plan_zeros(workbench, selected), _log(robot, None), dry_run=dry_run, yes=yes)
+            _carry_out(editor, plan_zeros(editor, selected), _log(robot, None), dry_run=dry_run, yes=yes)
             return
-        say(*zero_lines(zero_ticks(workbench, selected)))
+        say(*zero_lines(zero_ticks(editor, selected)))
         say(f"Put it into the entry of the joint in {robot}. Nothing was written.")
 
 
 def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
     from bodyschema.cli.servos.changes import plan_undo
-    from bodyschema.daemon.wiring.eeprom import workbench_of
+    from bodyschema.daemon.wiring.eeprom import editor_of
 
     log = _log(robot, port)
     entries = log.to_undo()
@@ -130,10 +130,10 @@ def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
         raise ConfigError(
             "there is nothing to take back", file=log.file, remedy="Nothing was written, or all is undone"
         )
-    with workbench_of(entries[0].table) as workbench:
-        planned, left = plan_undo(workbench, entries)
+    with editor_of(entries[0].table) as editor:
+        planned, left = plan_undo(editor, entries)
         say(*(f"left alone: {line}" for line in left))
-        _carry_out(workbench, planned, log, dry_run=dry_run, yes=yes, undoes=entries[0].batch)
+        _carry_out(editor, planned, log, dry_run=dry_run, yes=yes, undoes=entries[0].batch)
 
 
 def _selected_servos(
@@ -151,10 +151,10 @@ def _selected_servos(
     return [stranger(port, baud, id)]
 
 
-def _workbench(selected: Sequence[SelectedServo]) -> EepromEditor:
-    from bodyschema.daemon.wiring.eeprom import workbench_of
+def _editor(selected: Sequence[SelectedServo]) -> EepromEditor:
+    from bodyschema.daemon.wiring.eeprom import editor_of
 
-    return workbench_of(selected[0].table)
+    return editor_of(selected[0].table)
 
 
 def _log(robot: Path, port: str | None) -> ServoLog:
@@ -166,7 +166,7 @@ def _log(robot: Path, port: str | None) -> ServoLog:
 
 
 def _carry_out(
-    workbench: EepromEditor,
+    editor: EepromEditor,
     planned: Sequence[Planned],
     log: ServoLog,
     *,
@@ -186,7 +186,7 @@ def _carry_out(
     if dry_run or not (yes or Confirm.ask(question, console=console, default=False)):
         say("Nothing was written, and torque is as it was.")
         return
-    done = carry_out(workbench, planned, log, SystemClock(), undoes=undoes)
+    done = carry_out(editor, planned, log, SystemClock(), undoes=undoes)
     console.print(done_table(done))
     say(f"Kept in {log.file}.")
     if not is_well(done):

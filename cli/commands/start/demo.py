@@ -26,7 +26,7 @@ def demo(
     seed: Annotated[int, Parameter(help="Another robot, another path, other noise.", validator=Number(gte=0))] = 0,
     bus: Annotated[
         Literal["dynamixel", "feetech", "serial", "ros2"] | None,
-        Parameter(help="The joints stand on a bench and are read by this driver.", show_default=False),
+        Parameter(help="The joints are emulated and read by this driver.", show_default=False),
     ] = None,
     marker: Annotated[
         Literal["ball", "tag", "cluster"] | None,
@@ -71,7 +71,7 @@ def demo(
     marker = marker or ("tag" if camera == "mono" else "ball")
     scene = prepare(out, seed, bus=bus, marker=marker, camera=camera)
     if bus is not None:
-        console.print(f"The joints are {WHAT[bus]} on a bench; their log is {scene.log_file}.", soft_wrap=True)
+        console.print(f"The joints are {WHAT[bus]}, emulated; their log is {scene.log_file}.", soft_wrap=True)
     with shown_on(console) as show:
         outcome = play(scene, first=pairs, second=pairs_after, seed=seed, show=show)
     write_curve(outcome.rows, scene.curve_file)

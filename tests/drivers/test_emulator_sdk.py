@@ -10,11 +10,11 @@ import pytest
 from virtual_port import VirtualClock, VirtualPort
 from wire_faults import Planned
 
-from bodyschema.drivers.bench.faults import half, mute, wrong_checksum
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.servo import Servo
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.models import BY_NAME
+from bodyschema.drivers.emulator.faults import half, mute, wrong_checksum
+from bodyschema.drivers.emulator.pty_shell import PtyShell
 
 XM, AX, MX1, PH = BY_NAME["XM430-W350"], BY_NAME["AX-12A"], BY_NAME["MX-28"], BY_NAME["PH54-200-S500"]
 ANGLES = {1: 0.5, 2: -1.0, 3: 7.0}

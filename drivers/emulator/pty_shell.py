@@ -78,7 +78,7 @@ class _Serving:
         self.name = os.ttyname(self._slave)
         self._due: list[tuple[float, int, bytes]] = []
         self._order = 0
-        self._thread = threading.Thread(target=self._serve, name="bench")
+        self._thread = threading.Thread(target=self._serve, name="emulator")
         self._thread.start()
 
     def stop(self) -> None:

@@ -8,19 +8,19 @@ from importlib.resources import files
 import pytest
 from virtual_port import VirtualClock, VirtualPort, at_once
 
-from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.faults import mute
-from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
-from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.emulator.chain import Chain as DynamixelChain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL, settings_of
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXELS
 from bodyschema.drivers.dynamixel.models import MODELS
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.device import Reply
+from bodyschema.drivers.emulator.faults import mute
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECHS
 from bodyschema.drivers.servos.config import ServoConfig
-from bodyschema.drivers.servos.workbench import Change, EepromEditor, Outcome
+from bodyschema.drivers.servos.eeprom_editor import Change, EepromEditor, Outcome
 from bodyschema.interfaces.errors import ConfigError, SourceError
 
 RATE = 1_000_000
@@ -37,30 +37,30 @@ class Arm:
         self.models = [known[name] for name in models]
         kinds = (DynamixelChain, DynamixelServo) if is_dynamixel else (FeetechChain, FeetechServo)
         self.chain = kinds[0]([kinds[1](model, id, lambda _: angle) for id, model in enumerate(self.models, 1)])
-        self.bench = EepromEditor(DYNAMIXEL if is_dynamixel else FEETECH, self.clock, self.open)
+        self.emulator = EepromEditor(DYNAMIXEL if is_dynamixel else FEETECH, self.clock, self.open)
 
     def open(self, port: str, baud: int):
         return VirtualPort(self.chain, self.clock, outwards=at_once, inwards=at_once, baud=baud), 0.0
 
     @property
     def bus(self):
-        return self.bench.bus("bench", RATE)
+        return self.emulator.bus("emulator", RATE)
 
     def identified_servo(self, id: int = 1):
-        return self.bench.identified_servo(
+        return self.emulator.identified_servo(
             self.bus, ServoConfig(f"joint{id}", id, self.models[id - 1].name), self.models[id - 1]
         )
 
     def change(self, name: str, target: int, id: int = 1) -> Change:
         servo = self.identified_servo(id)
-        setting = {setting.name: setting for setting in self.bench.vendor.settings(servo.model)}[name]
-        return Change(servo, setting, self.bench.value(self.bus, servo, setting), target)
+        setting = {setting.name: setting for setting in self.emulator.vendor.settings(servo.model)}[name]
+        return Change(servo, setting, self.emulator.value(self.bus, servo, setting), target)
 
 
 @pytest.mark.parametrize("models", ARMS)
 def test_a_number_is_written_and_read_back(models) -> None:
     arm = Arm(models)
-    done = arm.bench.write(arm.bus, arm.change("return_delay", 0))
+    done = arm.emulator.write(arm.bus, arm.change("return_delay", 0))
     assert (done.outcome, done.found, done.remarks) == (Outcome.WRITTEN, 0, "")
     assert (arm.chain.servo(1)["return_delay"], arm.chain.servo(2)["return_delay"]) == (0, 250)
 
@@ -68,7 +68,7 @@ def test_a_number_is_written_and_read_back(models) -> None:
 @pytest.mark.parametrize("models", ARMS)
 def test_written_value_survives_a_power_cycle(models) -> None:
     arm = Arm(models)
-    arm.bench.write(arm.bus, arm.change("return_delay", 0))
+    arm.emulator.write(arm.bus, arm.change("return_delay", 0))
     arm.chain.power_cycle(arm.clock.now())
     assert arm.chain.servo(1)["return_delay"] == 0
 
@@ -77,15 +77,15 @@ def test_written_value_survives_a_power_cycle(models) -> None:
 def test_the_eeprom_is_locked_again(models) -> None:
     arm = Arm(models)
     for name, target in (("return_delay", 0), ("id", 9)):
-        assert arm.bench.write(arm.bus, arm.change(name, target)).remarks == ""
+        assert arm.emulator.write(arm.bus, arm.change(name, target)).remarks == ""
     assert arm.chain.servo(9)["lock"] == 1
 
 
 @pytest.mark.parametrize("models", ARMS)
 def test_servo_answers_at_its_new_id(models) -> None:
     arm = Arm(models)
-    assert arm.bench.write(arm.bus, arm.change("id", 7)).outcome is Outcome.WRITTEN
-    assert (arm.bench.is_taken(arm.bus, 7), arm.bench.is_taken(arm.bus, 1)) == (True, False)
+    assert arm.emulator.write(arm.bus, arm.change("id", 7)).outcome is Outcome.WRITTEN
+    assert (arm.emulator.is_taken(arm.bus, 7), arm.emulator.is_taken(arm.bus, 1)) == (True, False)
 
 
 @pytest.mark.parametrize("models", ARMS)
@@ -94,7 +94,7 @@ def test_all_servos_answer_at_the_new_rate(models) -> None:
     changes = [arm.change("baud", 0, id) for id in (1, 2)]
     target = changes[0].setting.words["57600"]
     changes = [replace(change, target=target) for change in changes]
-    done = arm.bench.write_bauds("bench", RATE, 57_600, changes)
+    done = arm.emulator.write_bauds("emulator", RATE, 57_600, changes)
     assert [one.outcome for one in done] == [Outcome.WRITTEN] * 2
     assert [servo.baud // 100 for servo in arm.chain.servos] in ([576, 576], [571, 571])
 
@@ -103,14 +103,14 @@ def test_servo_refusing_a_new_rate_keeps_the_old() -> None:
     arm = Arm()
     arm.chain.servo(1)["torque"] = 1
     change = arm.change("baud", 1)
-    (done,) = arm.bench.write_bauds("bench", RATE, 57_600, [change])
+    (done,) = arm.emulator.write_bauds("emulator", RATE, 57_600, [change])
     assert (done.outcome, done.remarks) == (Outcome.KEPT, "it still answers at 1,000,000 bit/s")
 
 
 def test_refused_write_is_reported_as_kept() -> None:
     arm = Arm()
     arm.chain.servo(1)["torque"] = 1  # locks the EEPROM
-    done = arm.bench.write(arm.bus, arm.change("return_delay", 0))
+    done = arm.emulator.write(arm.bus, arm.change("return_delay", 0))
     assert (done.outcome, done.found) == (Outcome.KEPT, 250)
 
 
@@ -123,7 +123,7 @@ def test_lost_cable_after_write_gives_unknown_outcome(models) -> None:
         return mute(reply, None) if arm.chain.servo(1)["return_delay"] == 0 else reply
 
     arm.chain.faults = cut
-    done = arm.bench.write(arm.bus, change)
+    done = arm.emulator.write(arm.bus, change)
     assert (done.outcome, done.found) == (Outcome.UNKNOWN, None)
     assert "no answer after it was written" in done.remarks
 
@@ -132,7 +132,7 @@ def test_lost_cable_after_write_gives_unknown_outcome(models) -> None:
 def test_torque_is_off_before_anything_is_written(models) -> None:
     arm = Arm(models)
     arm.chain.servo(1)["torque"] = 1
-    arm.bench.torque_off(arm.bus, [arm.identified_servo()])
+    arm.emulator.torque_off(arm.bus, [arm.identified_servo()])
     assert arm.chain.servo(1)["torque"] == 0
 
 
@@ -141,21 +141,21 @@ def test_torque_is_off_before_anything_is_written(models) -> None:
 def test_homing_offset_makes_the_current_position_zero(models, angle) -> None:
     arm = Arm(models, angle)
     servo = arm.identified_servo()
-    arm.bench.write(arm.bus, arm.change("homing_offset", arm.bench.homing_offset(arm.bus, servo)))
-    assert arm.bench.position(arm.bus, servo) == servo.zero_ticks
+    arm.emulator.write(arm.bus, arm.change("homing_offset", arm.emulator.homing_offset(arm.bus, servo)))
+    assert arm.emulator.position(arm.bus, servo) == servo.zero_ticks
 
 
 def test_servo_of_another_model_is_not_written() -> None:
     arm = Arm()
     wrong = DYNAMIXELS["XM540-W270"]
     with pytest.raises(SourceError, match=r"XM430-W350: wrong model.*nothing was written"):
-        arm.bench.identified_servo(arm.bus, ServoConfig("joint1", 1, wrong.name), wrong)
+        arm.emulator.identified_servo(arm.bus, ServoConfig("joint1", 1, wrong.name), wrong)
 
 
 @pytest.mark.parametrize("models", ARMS)
 def test_unlisted_servo_reports_its_model(models) -> None:
     arm = Arm(models)
-    assert arm.bench.model_at(arm.bus, 2) == arm.models[1]
+    assert arm.emulator.model_at(arm.bus, 2) == arm.models[1]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .chain import ServoChain, ServoT
 from .device import Angle, Faults
-from .dry_run import GLITCH_TICKS, BenchArm
+from .dry_run import GLITCH_TICKS, DryRunArm
 from .faults import FaultKinds, FaultSpec, WireFaults
 
 
@@ -67,7 +67,7 @@ AT_THE_START = ("baud", "double", "torque")
 ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 
 
-class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
+class ServoArm(DryRunArm, Generic[ServoT, ConfigT]):
     """Servos as configured, one chain per bus."""
 
     unit: ClassVar[str] = "packets understood"

@@ -1,4 +1,4 @@
-"""`bodyschema bench`."""
+"""`bodyschema emulate`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.waits import Waits
 
 if TYPE_CHECKING:
-    from bodyschema.cli.hardware.bench_run import BenchRun
+    from bodyschema.cli.hardware.emulator_run import EmulatorRun
 
 PORT = Path("bus")
 
 
-def bench(
+def emulate(
     *,
     port: Annotated[Path, Parameter(help="The name of the port to make; PORT-BUS for each of several buses.")] = PORT,
     robot: RobotFile = HERE,
@@ -42,7 +42,7 @@ def bench(
 
     Next: in another terminal `bodyschema scan`, `doctor` or `watch joints`, each with --robot PORT.toml.
     """
-    from bodyschema.cli.hardware.bench_run import FAULTS, BenchRun
+    from bodyschema.cli.hardware.emulator_run import FAULTS, EmulatorRun
     from bodyschema.daemon.config import Config
 
     console = Console(highlight=False, soft_wrap=True)
@@ -50,13 +50,13 @@ def bench(
         say(*(f"{kind:12} {meaning}" for kind, meaning in FAULTS.items()))
         return
     config = Config.load(robot)
-    run = BenchRun(config, port, faults=fault, return_delay_s=return_delay_us * 1e-6, seed=seed)
+    run = EmulatorRun(config, port, faults=fault, return_delay_s=return_delay_us * 1e-6, seed=seed)
     with on_termination(run.stop), _made(run, console) as opened:
         say(*opened.introduction())
         _look_on(opened, console)
 
 
-def _made(run: BenchRun, console: Console) -> BenchRun:
+def _made(run: EmulatorRun, console: Console) -> EmulatorRun:
     """Prepare the emulator's motion, which takes a moment; return the emulator."""
     if not console.is_terminal:
         run.prepare(lambda _: None)
@@ -66,7 +66,7 @@ def _made(run: BenchRun, console: Console) -> BenchRun:
     return run
 
 
-def _look_on(run: BenchRun, console: Console) -> None:
+def _look_on(run: EmulatorRun, console: Console) -> None:
     with console.status("nothing has gone over the wire yet") as status:
         while not run.stopping:
             for said in run.due():

@@ -25,7 +25,7 @@ GLITCH_TICKS = 700  # by which an encoder is wrong
 Event = tuple[float, str, Callable[[], None]]
 
 
-class BenchArm(ABC):
+class DryRunArm(ABC):
     """The devices behind the ports of an emulated arm.
 
     Attributes:
@@ -65,7 +65,7 @@ class DryRun:
         shells: pseudo-terminals, by name of the bus.
     """
 
-    def __init__(self, arm: BenchArm, links: Mapping[str, Path], *, faults: Sequence[FaultSpec] = ()) -> None:
+    def __init__(self, arm: DryRunArm, links: Mapping[str, Path], *, faults: Sequence[FaultSpec] = ()) -> None:
         """Prepare the ports without opening them.
 
         Args:

@@ -17,12 +17,12 @@ from typing import Any
 import msgspec
 
 from bodyschema.daemon.config import Config
-from bodyschema.drivers.bench.device import Angle
-from bodyschema.drivers.bench.dry_run import BenchArm, DryRun
-from bodyschema.drivers.bench.faults import FaultSpec
-from bodyschema.drivers.bench.servo_arm import played, swinging
-from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver, ThroughDriverSettings
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
+from bodyschema.drivers.emulator.device import Angle
+from bodyschema.drivers.emulator.dry_run import DryRun, DryRunArm
+from bodyschema.drivers.emulator.faults import FaultSpec
+from bodyschema.drivers.emulator.servo_arm import played, swinging
+from bodyschema.drivers.emulator.through_driver import Behind, ThroughDriver, ThroughDriverSettings
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
@@ -45,7 +45,7 @@ class _Settings:
     settled_s: float = 2e-3  # how far off the time of a line may be
 
 
-MARK = "# Written by `bodyschema bench`, which removes it when it ends."
+MARK = "# Written by `bodyschema emulate`, which removes it when it ends."
 PSEUDO_TERMINALS = "/dev/pts/"
 
 OnPorts = DynamixelConfig | FeetechConfig | SerialLinesConfig
@@ -72,7 +72,7 @@ def require_on_ports(config: Config) -> OnPorts:
     )
 
 
-def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
+def emulated_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     """Return a motion guided by the simulated hand; without the simulation, a slow swing of each joint.
 
     Args:
@@ -102,7 +102,7 @@ def _no_simulation(config: Config) -> str:
     return ""
 
 
-def open_bench(
+def open_emulator(
     config: Config, port: Path, motion: Motion, *, faults: Sequence[str] = (), return_delay_s: float, seed: int
 ) -> DryRun:
     """Return the arm of robot.toml behind `port` (several buses: each at `port`-NAME), not opened yet.
@@ -124,20 +124,20 @@ def open_bench(
 
 
 def _arm_of(hardware: OnPorts) -> Any:
-    """Return the class of the emulated arm, a `BenchArm`."""
+    """Return the class of the emulated arm, a `DryRunArm`."""
     match hardware:
         case DynamixelConfig():
-            from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm as Arm
+            from bodyschema.drivers.dynamixel.emulator.arm import DynamixelArm as Arm
         case FeetechConfig():
-            from bodyschema.drivers.feetech.bench.arm import FeetechArm as Arm
+            from bodyschema.drivers.feetech.emulator.arm import FeetechArm as Arm
         case SerialLinesConfig():
-            from bodyschema.drivers.serial_lines.bench.arm import EncoderArm as Arm
+            from bodyschema.drivers.serial_lines.emulator.arm import EncoderArm as Arm
     return Arm
 
 
-def bench_ports(bench: DryRun) -> list[str]:
+def emulated_ports(emulator: DryRun) -> list[str]:
     """Return a line on the devices of each port."""
-    match bench.config:
+    match emulator.config:
         case SerialLinesConfig() as config:
             return [f"{_plural(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]
         case config:
@@ -148,10 +148,10 @@ def bench_ports(bench: DryRun) -> list[str]:
             ]
 
 
-def bench_commands(bench: DryRun) -> tuple[str, ...]:
+def emulate_commands(emulator: DryRun) -> tuple[str, ...]:
     """Return the names of the commands that can talk to the devices on the ports."""
     common = ("doctor", "watch joints")
-    return common if isinstance(bench.config, SerialLinesConfig) else ("scan", *common)
+    return common if isinstance(emulator.config, SerialLinesConfig) else ("scan", *common)
 
 
 def _plural(count: int, what: str) -> str:
@@ -160,17 +160,17 @@ def _plural(count: int, what: str) -> str:
 
 def _require_free(link: Path) -> None:
     """Raise ConfigError unless the path is free, or a link of an earlier emulator whose terminal is closed."""
-    is_of_a_bench = link.is_symlink() and os.readlink(link).startswith(PSEUDO_TERMINALS)
-    if is_of_a_bench and link.exists():
-        remedy = f"Give another --port, or end that bench. If none runs: rm {link}"
-        raise ConfigError("another bench has this port", file=link, remedy=remedy)
-    if not is_of_a_bench and os.path.lexists(link):
+    is_of_emulator = link.is_symlink() and os.readlink(link).startswith(PSEUDO_TERMINALS)
+    if is_of_emulator and link.exists():
+        remedy = f"Give another --port, or end that emulator. If none runs: rm {link}"
+        raise ConfigError("another emulator has this port", file=link, remedy=remedy)
+    if not is_of_emulator and os.path.lexists(link):
         raise ConfigError("is there already", file=link, remedy="Give another --port, a name that is not taken")
     if not link.parent.is_dir():
         raise ConfigError("there is no such folder", file=link.parent, remedy="Give another --port")
 
 
-def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
+def emulator_robot_file(config: Config, emulator: DryRun, port: Path) -> Path:
     """Write a copy of robot.toml beside `port`, with the emulator's ports and its own state.
 
     Raises:
@@ -179,7 +179,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     file = port.with_name(f"{port.name}.toml")
     tables, _ = read_toml(config.file)
     tables["robot"]["urdf"] = str(config.robot.tree.file.resolve())
-    match bench.config:
+    match emulator.config:
         case SerialLinesConfig() as board:
             tables["drivers"]["serial_lines"]["port"] = str(Path(board.port).absolute())
         case servos:
@@ -190,7 +190,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())
     with raising_write_errors(file, remedy="Give another --port"):
         if file.exists() and not read_at_most(file).startswith(MARK.encode()):
-            raise ConfigError("is there already, and no bench wrote it", file=file, remedy="Give another --port")
+            raise ConfigError("is there already, and no emulator wrote it", file=file, remedy="Give another --port")
         file.write_text(f"{MARK}\n{toml_text(tables)}", encoding="utf-8")
     return file
 
@@ -198,7 +198,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
 # --- in the simulation's place
 
 
-def require_bench(config: Config) -> OnPorts | Ros2Config:
+def require_emulator(config: Config) -> OnPorts | Ros2Config:
     """Return the driver settings for reading the simulation's joints; raise ConfigError if robot.toml has none."""
     robot = config.tables.drivers.ros2
     return require_on_ports(config) if robot is None else robot
@@ -207,9 +207,9 @@ def require_bench(config: Config) -> OnPorts | Ros2Config:
 OpenDriver = Callable[[OnPorts | Ros2Config], JointSource]
 
 
-def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) -> JointSource:
+def through_emulator(config: Config, joints: JointSource, open_driver: OpenDriver) -> JointSource:
     """Return the simulation's joints, read from an emulator by the driver configured in robot.toml."""
-    hardware = require_bench(config)
+    hardware = require_emulator(config)
     match hardware:
         case DynamixelConfig() | FeetechConfig():
             return ThroughDriver(joints, lambda angles: _looking_at_servos(hardware, angles, open_driver))
@@ -228,7 +228,7 @@ def _looking_at_servos(
         for name, bus in hardware.buses.items()
     }
     patient = msgspec.structs.replace(hardware, buses=buses)
-    with _on_a_bench(_arm_of(patient)(patient, angles)) as bench, open_driver(bench.config) as servos:
+    with _on_emulator(_arm_of(patient)(patient, angles)) as emulator, open_driver(emulator.config) as servos:
         yield Behind(servos, lambda: servos.read(ThroughDriverSettings.read_s))
 
 
@@ -237,12 +237,12 @@ def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
     """Yield joints read from an emulated board; each read waits for a line measured after it."""
-    from bodyschema.drivers.serial_lines.bench.board import Listener
+    from bodyschema.drivers.serial_lines.emulator.board import Listener
 
     clock = SystemClock()
     quick = msgspec.structs.replace(hardware, baud=_Settings.board_baud, delay_ms=0.0, native_usb=False)
     arm = _arm_of(quick)(quick, angles, rate_hz=_Settings.board_rate_hz)
-    with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
+    with _on_emulator(arm) as emulator, open_driver(emulator.config) as encoders, Listener(encoders) as listener:
         yield Behind(encoders, lambda: listener.after(clock.now() + _Settings.settled_s, ThroughDriverSettings.read_s))
 
 
@@ -251,8 +251,8 @@ def _looking_at_messages(
     hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
     """Yield joints read from a node and a router in this process; the node publishes at each read."""
-    from bodyschema.drivers.ros2.bench.node import Node
-    from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
+    from bodyschema.drivers.ros2.emulator.node import Node
+    from bodyschema.drivers.ros2.emulator.zenoh_robot import ZenohRobot
 
     clock = SystemClock()
     node = Node(dict(zip(hardware.ros_names(tuple(angles)), angles.values(), strict=True)), rate_hz=1.0)
@@ -269,9 +269,9 @@ def _looking_at_messages(
 
 
 @contextmanager
-def _on_a_bench(arm: BenchArm) -> Iterator[DryRun]:
+def _on_emulator(arm: DryRunArm) -> Iterator[DryRun]:
     with (
-        TemporaryDirectory(prefix="bodyschema-bench-") as folder,
-        DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as bench,
+        TemporaryDirectory(prefix="bodyschema-emulator-") as folder,
+        DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as emulator,
     ):
-        yield bench
+        yield emulator

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from bodyschema.drivers.bench.chain import EmulatedServo
-from bodyschema.drivers.bench.device import Angle
+from bodyschema.drivers.emulator.chain import EmulatedServo
+from bodyschema.drivers.emulator.device import Angle
 from bodyschema.drivers.feetech.models import BAUDS, SCS
 from bodyschema.drivers.servos.model import Model
 

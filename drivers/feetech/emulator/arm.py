@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from random import Random
 
-from bodyschema.drivers.bench.chain import ServoChain, mixed
-from bodyschema.drivers.bench.device import Angle, Faults, Reply, Sampling
-from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds
-from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
-from bodyschema.drivers.feetech.bench.servo import Servo
+from bodyschema.drivers.emulator.chain import ServoChain, mixed
+from bodyschema.drivers.emulator.device import Angle, Faults, Reply, Sampling
+from bodyschema.drivers.emulator.faults import ON_THE_WIRE, FaultKinds
+from bodyschema.drivers.emulator.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.feetech.config import FeetechConfig, ServoConfig
+from bodyschema.drivers.feetech.emulator.servo import Servo
 from bodyschema.drivers.feetech.models import BAUDS
 from bodyschema.drivers.servos.packets import BROADCAST, HEADER, summed
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping
 from typing import Self
 
-from bodyschema.drivers.bench.device import Angle, Faults, Reply, byte_s, no_faults
+from bodyschema.drivers.emulator.device import Angle, Faults, Reply, byte_s, no_faults
 from bodyschema.drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VERSION, with_checksum
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.protocols import JointSource
@@ -107,7 +107,7 @@ class Listener:
         self._newest: JointReading | None = None
         self._error: BodyschemaError | None = None
         self._changed, self._stop = threading.Condition(), threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="bench listener")
+        self._thread = threading.Thread(target=self._listen, name="emulator listener")
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import msgspec
 
-from bodyschema.drivers.bench.device import Angle
-from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, BenchArm
-from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds, FaultSpec, WireFaults
+from bodyschema.drivers.emulator.device import Angle
+from bodyschema.drivers.emulator.dry_run import GLITCH_TICKS, DryRunArm
+from bodyschema.drivers.emulator.faults import ON_THE_WIRE, FaultKinds, FaultSpec, WireFaults
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 
 from .board import EncoderBoard
@@ -21,7 +21,7 @@ KINDS = FaultKinds(ON_THE_WIRE, ("sensor", "glitch"))
 BUS = "board"
 
 
-class EncoderArm(BenchArm):
+class EncoderArm(DryRunArm):
     """Encoders as configured, on one board."""
 
     unit: ClassVar[str] = "lines said"

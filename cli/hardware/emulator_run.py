@@ -10,13 +10,13 @@ from types import MappingProxyType
 from typing import Self
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.wiring.bench import (
+from bodyschema.daemon.wiring.emulators import (
     Motion,
-    bench_commands,
-    bench_motion,
-    bench_ports,
-    bench_robot_file,
-    open_bench,
+    emulate_commands,
+    emulated_motion,
+    emulated_ports,
+    emulator_robot_file,
+    open_emulator,
 )
 
 FAULTS: Mapping[str, str] = MappingProxyType(
@@ -45,7 +45,7 @@ FAULTS: Mapping[str, str] = MappingProxyType(
 )
 
 
-class BenchRun:
+class EmulatorRun:
     """The emulated servos of a robot.toml behind a port, with a robot.toml that names this port."""
 
     def __init__(
@@ -65,11 +65,11 @@ class BenchRun:
         """
         self._config, self._port, self._now = config, port, now
         self._motion = Motion(dict.fromkeys(config.robot.joints, _still), "standing still")
-        self._make = lambda motion: open_bench(
+        self._make = lambda motion: open_emulator(
             config, port, motion, faults=faults, return_delay_s=return_delay_s, seed=seed
         )
-        self._bench = self._make(self._motion)
-        self._events = self._bench.events()
+        self._emulator = self._make(self._motion)
+        self._events = self._emulator.events()
         self._next: tuple[float, str, Callable[[], None]] | None = None
         self._opened = ExitStack()
         self.robot_file = port.with_name(f"{port.name}.toml")
@@ -77,16 +77,16 @@ class BenchRun:
 
     def prepare(self, tell: Callable[[float], None]) -> None:
         """Compute the motion; `tell` is called with the completed share."""
-        self._motion = bench_motion(self._config, tell)
-        self._bench = self._make(self._motion)
+        self._motion = emulated_motion(self._config, tell)
+        self._emulator = self._make(self._motion)
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            stack.enter_context(self._bench)
-            file = bench_robot_file(self._config, self._bench, self._port)
+            stack.enter_context(self._emulator)
+            file = emulator_robot_file(self._config, self._emulator, self._port)
             stack.callback(file.unlink, missing_ok=True)
             self._opened = stack.pop_all()
-        self._events = self._bench.events()
+        self._events = self._emulator.events()
         self._plan_next(self._now())
         return self
 
@@ -96,12 +96,12 @@ class BenchRun:
     @property
     def count(self) -> int:
         """Number of packets understood, or of lines sent."""
-        return self._bench.arm.count
+        return self._emulator.arm.count
 
     @property
     def unit(self) -> str:
         """Unit of `count`."""
-        return self._bench.arm.unit
+        return self._emulator.arm.unit
 
     def stop(self) -> None:
         """Request the end. Only sets a flag: a signal handler may call it."""
@@ -118,13 +118,13 @@ class BenchRun:
     def introduction(self) -> Iterator[str]:
         """Yield a description of the emulation, and the commands to type in another terminal."""
         config, file = self._config, self.robot_file
-        for words in bench_ports(self._bench):
+        for words in emulated_ports(self._emulator):
             yield f"{config.robot.name}: {words}"
         yield self._motion.words
         yield "In another terminal:"
-        for command in bench_commands(self._bench):
+        for command in emulate_commands(self._emulator):
             yield f"  bodyschema {command} --robot {file}"
-        yield f"{file} is {config.file} with the bench's port. Ctrl-C ends the bench."
+        yield f"{file} is {config.file} with the emulator's port. Ctrl-C ends the emulator."
 
     def _plan_next(self, after: float) -> None:
         event = next(self._events, None)

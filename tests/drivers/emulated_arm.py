@@ -8,10 +8,10 @@ from typing import Literal
 from servo_arm import Path, ServoArm
 from virtual_port import VirtualPort
 
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.frames import Code, instructions_in
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.frames import Code, instructions_in
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
 
@@ -56,6 +56,6 @@ class Arm(ServoArm):
 
         wire = {"latency_s": latency_s, "held_s": held_s, "seed": seed}
         super().__init__(models, paths, servo=servo, chain=Chain, port=HeardPort, **wire)
-        buses = {"arm": BusConfig("bench", fast_sync_read=fast)}
+        buses = {"arm": BusConfig("emulator", fast_sync_read=fast)}
         self.config = DynamixelConfig(buses, self.entries(ServoConfig), **settings)
         self.driven(DynamixelJoints, self.config, limits=limits, last_pose=last_pose)

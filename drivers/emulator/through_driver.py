@@ -30,8 +30,8 @@ class Behind:
     look: Callable[[], JointReading | None]
 
 
-OpenBench = Callable[[Mapping[str, Angle]], AbstractContextManager[Behind]]
-"""Puts joints, by name, on a bench, and opens the driver that reads them."""
+OpenEmulator = Callable[[Mapping[str, Angle]], AbstractContextManager[Behind]]
+"""Puts joints, by name, on an emulator, and opens the driver that reads them."""
 
 
 class ThroughDriver:
@@ -41,13 +41,13 @@ class ThroughDriver:
     are kept. Only the encoder resolution changes the angles.
     """
 
-    def __init__(self, source: JointSource, open_bench: OpenBench) -> None:
+    def __init__(self, source: JointSource, open_emulator: OpenEmulator) -> None:
         """Prepare without opening anything.
 
         Args:
             source: gives the angles; its clock advances only while it is read.
         """
-        self._source, self._open_bench = source, open_bench
+        self._source, self._open_emulator = source, open_emulator
         self._opened = ExitStack()
         self._behind: Behind | None = None
         self._q = [0.0] * len(source.joints)
@@ -96,7 +96,7 @@ class ThroughDriver:
         self._q = source_reading.q.tolist()
         if self._behind is None:  # only once the first angles are known, or the arm would jump there
             angles = {name: self._angle(place) for place, name in enumerate(self.joints)}
-            self._behind = self._opened.enter_context(self._open_bench(angles))
+            self._behind = self._opened.enter_context(self._open_emulator(angles))
         for _ in range(ThroughDriverSettings.attempts):
             driver_reading = self._behind.look()
             if driver_reading is not None:

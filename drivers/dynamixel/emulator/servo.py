@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from bodyschema.drivers.bench.chain import EmulatedServo
-from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
+from bodyschema.drivers.emulator.chain import EmulatedServo
+from bodyschema.drivers.emulator.device import Angle
 
 from .factory import factory_values, indirect_blocks
 from .frames import Error

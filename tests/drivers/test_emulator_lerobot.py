@@ -19,12 +19,12 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from bodyschema.drivers.bench.pty_shell import PtyShell
-from bodyschema.drivers.dynamixel.bench.chain import Chain as DynamixelChain
-from bodyschema.drivers.dynamixel.bench.servo import Servo as DynamixelServo
+from bodyschema.drivers.dynamixel.emulator.chain import Chain as DynamixelChain
+from bodyschema.drivers.dynamixel.emulator.servo import Servo as DynamixelServo
 from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL
-from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
+from bodyschema.drivers.emulator.pty_shell import PtyShell
+from bodyschema.drivers.feetech.emulator.arm import Chain as FeetechChain
+from bodyschema.drivers.feetech.emulator.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
 from bodyschema.robot.lerobot import ARMS, Make, MotorCalibration
 

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
 
-from bodyschema.drivers.bench.device import Angle, Faults, Reply
-from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds
-from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
-from bodyschema.drivers.dynamixel.bench.chain import Chain
-from bodyschema.drivers.dynamixel.bench.frames import HEADER2
-from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.crc16 import crc16
+from bodyschema.drivers.dynamixel.emulator.chain import Chain
+from bodyschema.drivers.dynamixel.emulator.frames import HEADER2
+from bodyschema.drivers.dynamixel.emulator.servo import Servo
 from bodyschema.drivers.dynamixel.models import baud_value
+from bodyschema.drivers.emulator.device import Angle, Faults, Reply
+from bodyschema.drivers.emulator.faults import ON_THE_WIRE, FaultKinds
+from bodyschema.drivers.emulator.servo_arm import AT_THE_START, ServoArm
 
 
 class _Settings:

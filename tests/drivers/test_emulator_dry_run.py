@@ -14,23 +14,23 @@ import msgspec
 import numpy as np
 import pytest
 
-from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.dry_run import DryRun
-from bodyschema.drivers.bench.faults import FaultKinds, FaultSpec, WireFaults
-from bodyschema.drivers.bench.servo_arm import played, swinging
-from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver
-from bodyschema.drivers.dynamixel.bench.arm import KINDS, DynamixelArm
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
+from bodyschema.drivers.dynamixel.emulator.arm import KINDS, DynamixelArm
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.powered_config import GazeConfig
-from bodyschema.drivers.feetech.bench.arm import KINDS as FEETECH_KINDS
-from bodyschema.drivers.feetech.bench.arm import FeetechArm
+from bodyschema.drivers.emulator.device import Reply
+from bodyschema.drivers.emulator.dry_run import DryRun
+from bodyschema.drivers.emulator.faults import FaultKinds, FaultSpec, WireFaults
+from bodyschema.drivers.emulator.servo_arm import played, swinging
+from bodyschema.drivers.emulator.through_driver import Behind, ThroughDriver
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
+from bodyschema.drivers.feetech.emulator.arm import KINDS as FEETECH_KINDS
+from bodyschema.drivers.feetech.emulator.arm import FeetechArm
 from bodyschema.drivers.feetech.joints import FeetechJoints
-from bodyschema.drivers.serial_lines.bench.arm import KINDS as LINE_KINDS
-from bodyschema.drivers.serial_lines.bench.arm import EncoderArm
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
+from bodyschema.drivers.serial_lines.emulator.arm import KINDS as LINE_KINDS
+from bodyschema.drivers.serial_lines.emulator.arm import EncoderArm
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceError
@@ -87,8 +87,8 @@ def standing(tmp_path: Path, make: str, *faults: str, config: Any = None, seed: 
     return DryRun(arm, {name: tmp_path / name for name in arm.devices}, faults=asked)
 
 
-def reading(bench: DryRun, make: str) -> JointReading:
-    with MAKES[make][3](bench.config, JOINTS, SystemClock(), limits=LIMITS) as joints:
+def reading(emulator: DryRun, make: str) -> JointReading:
+    with MAKES[make][3](emulator.config, JOINTS, SystemClock(), limits=LIMITS) as joints:
         for _ in range(100):
             told = joints.read(0.1)
             if told is not None:
@@ -100,21 +100,21 @@ def reading(bench: DryRun, make: str) -> JointReading:
 
 
 @EACH
-def test_driver_reads_the_angles_given_to_bench(make, tmp_path) -> None:
-    with standing(tmp_path, make) as bench:
-        assert reading(bench, make).q == pytest.approx(POSE, abs=TICK)
-        assert bench.arm.count > 0
+def test_driver_reads_the_angles_given_to_emulator(make, tmp_path) -> None:
+    with standing(tmp_path, make) as emulator:
+        assert reading(emulator, make).q == pytest.approx(POSE, abs=TICK)
+        assert emulator.arm.count > 0
 
 
 def test_each_bus_has_a_port_of_its_own(tmp_path) -> None:
     two = dynamixel(("arm", "hand"), ("arm", "arm", "hand"))
-    with standing(tmp_path, "Dynamixel", config=two) as bench:
-        assert reading(bench, "Dynamixel").q == pytest.approx(POSE, abs=TICK)
+    with standing(tmp_path, "Dynamixel", config=two) as emulator:
+        assert reading(emulator, "Dynamixel").q == pytest.approx(POSE, abs=TICK)
         assert {path.name for path in tmp_path.iterdir()} == {"arm", "hand"}
 
 
 @EACH
-def test_ended_bench_leaves_no_files(make, tmp_path) -> None:
+def test_ended_emulator_leaves_no_files(make, tmp_path) -> None:
     with standing(tmp_path, make):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -122,19 +122,19 @@ def test_ended_bench_leaves_no_files(make, tmp_path) -> None:
 
 @SERVOS
 def test_a_servo_at_another_rate_is_missing(make, tmp_path) -> None:
-    with standing(tmp_path, make, "baud@elbow") as bench, pytest.raises(SourceError, match=r"elbow +5 .* no answer"):
-        reading(bench, make)
+    with standing(tmp_path, make, "baud@elbow") as emulator, pytest.raises(SourceError, match=r"elbow +5 .* no answer"):
+        reading(emulator, make)
 
 
 @SERVOS
 def test_two_servos_of_one_id_are_refused(make, tmp_path) -> None:
-    with standing(tmp_path, make, "double@waist") as bench, pytest.raises(SourceError, match="waist"):
-        reading(bench, make)
+    with standing(tmp_path, make, "double@waist") as emulator, pytest.raises(SourceError, match="waist"):
+        reading(emulator, make)
 
 
 def test_a_sensor_without_a_value_is_refused(tmp_path) -> None:
-    with standing(tmp_path, "serial lines", "sensor@elbow") as bench, pytest.raises(SourceError, match="'elbow'"):
-        reading(bench, "serial lines")
+    with standing(tmp_path, "serial lines", "sensor@elbow") as emulator, pytest.raises(SourceError, match="'elbow'"):
+        reading(emulator, "serial lines")
 
 
 @pytest.mark.parametrize(("make", "register"), [("Dynamixel", "hardware_error"), ("Feetech", "status")])
@@ -144,45 +144,45 @@ def test_an_overload_is_in_the_servo(make, register, tmp_path) -> None:
 
 @EACH
 def test_an_unplugged_port_is_gone_and_comes_back(make, tmp_path) -> None:
-    with standing(tmp_path, make, "unplug") as bench:
-        events = bench.events()
+    with standing(tmp_path, make, "unplug") as emulator:
+        events = emulator.events()
         _, _, unplug = next(events)
         _, _, plug_in = next(events)
         (link,) = tmp_path.iterdir()
         unplug()
         assert not link.is_symlink()
         plug_in()
-        assert reading(bench, make).q == pytest.approx(POSE, abs=TICK)
+        assert reading(emulator, make).q == pytest.approx(POSE, abs=TICK)
 
 
 @SERVOS
 def test_a_glitch_is_over_with_the_next_event(make, tmp_path) -> None:
-    bench = standing(tmp_path, make, "glitch@elbow")
-    events = bench.events()
+    emulator = standing(tmp_path, make, "glitch@elbow")
+    events = emulator.events()
     next(events)[2]()
-    assert bench.arm.servo("elbow").glitch_ticks != 0
+    assert emulator.arm.servo("elbow").glitch_ticks != 0
     next(events)[2]()
-    assert bench.arm.servo("elbow").glitch_ticks == 0
+    assert emulator.arm.servo("elbow").glitch_ticks == 0
 
 
 @SERVOS
 def test_power_cycle_clears_the_ram(make, tmp_path) -> None:
-    bench = standing(tmp_path, make, "power-cycle", "torque@waist")
-    assert bench.arm.servo("waist")["torque"] == 1
-    next(bench.events())[2]()
-    assert bench.arm.servo("waist")["torque"] == 0
+    emulator = standing(tmp_path, make, "power-cycle", "torque@waist")
+    assert emulator.arm.servo("waist")["torque"] == 1
+    next(emulator.events())[2]()
+    assert emulator.arm.servo("waist")["torque"] == 0
 
 
 def test_a_board_that_lost_its_power_says_so(tmp_path) -> None:
-    bench = standing(tmp_path, "serial lines", "power-cycle")
-    board = bench.arm.devices["board"]
+    emulator = standing(tmp_path, "serial lines", "power-cycle")
+    board = emulator.arm.devices["board"]
     before = board.speak(board.speaks_at, 115_200)[0].data
-    next(bench.events())[2]()
+    next(emulator.events())[2]()
     after = board.speak(board.speaks_at, 115_200)[0].data
     assert before.split(b"H,1,")[1].split(b",")[0] != after.split(b"H,1,")[1].split(b",")[0]
 
 
-def test_a_bench_without_faults_has_no_events(tmp_path) -> None:
+def test_emulator_without_faults_has_no_events(tmp_path) -> None:
     assert list(standing(tmp_path, "Dynamixel").events()) == []
 
 
@@ -307,8 +307,8 @@ def through(source: Any, make: str) -> ThroughDriver:
         arm = arm_of(config, angles)
         with (
             TemporaryDirectory() as folder,
-            DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as bench,
-            driver(bench.config, JOINTS, SystemClock(), limits=LIMITS) as joints,
+            DryRun(arm, {name: Path(folder) / name for name in arm.devices}) as emulator,
+            driver(emulator.config, JOINTS, SystemClock(), limits=LIMITS) as joints,
         ):
             yield Behind(joints, lambda: joints.read(1.0))
 
@@ -329,7 +329,7 @@ def test_servo_readings_keep_times_and_have_servo_resolution(make) -> None:
 
 @EACH
 @pytest.mark.usefixtures("patient_host")
-def test_readings_through_a_bench_can_be_opened_again(make) -> None:
+def test_readings_through_emulator_can_be_opened_again(make) -> None:
     source = through(Scripted([POSE] * 2), make)
     for _ in range(2):
         with source:

@@ -40,7 +40,7 @@ class ZenohRobot:
         self._stop.clear()
         key = self._topic.strip("/")
         if self._via == "rmw_zenoh":
-            token = rmw.publisher_token(self._domain, str(session.info.zid()), "bench", self._topic, JOINT_STATE)
+            token = rmw.publisher_token(self._domain, str(session.info.zid()), "emulator", self._topic, JOINT_STATE)
             self._token = session.liveliness().declare_token(token)
             key = rmw.topic_key(self._domain, self._topic, JOINT_STATE)
         # Like a robot with rmw_zenoh, drop messages that a slow reader cannot take.
@@ -70,7 +70,7 @@ class ZenohRobot:
 
     def start(self) -> None:
         """Publish the messages of all nodes, each at its rate, until the end."""
-        self._threads = [threading.Thread(target=self._run, args=(node,), name="bench") for node in self._nodes]
+        self._threads = [threading.Thread(target=self._run, args=(node,), name="emulator") for node in self._nodes]
         for thread in self._threads:
             thread.start()
 

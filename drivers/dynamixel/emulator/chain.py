@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bodyschema.drivers.bench.chain import ServoChain, mixed
-from bodyschema.drivers.bench.device import Reply, Sampling, no_faults
 from bodyschema.drivers.dynamixel.models import PING_SLOT_S
+from bodyschema.drivers.emulator.chain import ServoChain, mixed
+from bodyschema.drivers.emulator.device import Reply, Sampling, no_faults
 
 from .frames import (
     ALERT,

@@ -1,5 +1,0 @@
-"""Emulator at the byte level: a port in virtual time or on a pseudo-terminal, with fault injection.
-
-Behind the port is a `device.Device`: a chain of servos (`drivers/dynamixel/bench`, `drivers/feetech/bench`) or encoders
-that send unasked (`drivers/serial_lines/bench`).
-"""
