@@ -20,48 +20,9 @@ import grimp
 ROOT = Path(__file__).parents[1]
 NOT_PRODUCT = ("tests", "benchmarks", "docs", "examples")
 SMALL = 80
-# Numbers that nobody tuned: register tables, wire and file formats, in the modules that hold nothing else.
-TABLES = (
-    "drivers/dynamixel/emulator/factory.py",
-    "drivers/dynamixel/emulator/frames.py",
-    "drivers/dynamixel/emulator/servo.py",
-    "drivers/dynamixel/crc16.py",
-    "drivers/dynamixel/models.py",
-    "drivers/dynamixel/packets.py",
-    "drivers/feetech/emulator/servo.py",
-    "drivers/feetech/models.py",
-    "drivers/markers/natnet/packets.py",
-    "drivers/ros2/cdr.py",
-    "drivers/ros2/messages.py",
-    "drivers/ros2/rmw.py",
-    "drivers/serial_lines/lines.py",
-    "recordings/store/schema.py",
-    "robot/lerobot.py",
-    "vision/tags/dictionary.py",
-)
-# And elsewhere: versions of formats, units, bytes of a protocol, constants of mathematics and of a distribution.
-FACTS = re.compile(
-    r"_?(SCHEMA|VERSION\w*|NANO|DEG|BITS_PER_BYTE|\w*BAUDS?2?|BROADCAST|\w*_ID|EYE|ZERO|NONE|NO_TURN|UNTURNED|IDENTITY|"
-    r"NORMAL_95|HALF_WIDTH_95|CHI2\w*|GOLDEN|MEAN_LENGTH|MEAN_OVER_RMS|MEDIAN_COSTS|DECADE|\w*_PER_UNIT|\w*_UNIT_S|"
-    r"POLYNOMIAL|STATUS|ALERT|TERMIOS2|LINE_SPEED|SO_\w+|PR_\w+|\w*_MODE|TURN_TICKS|CHECKSUM_BYTES|CHUNK)"
-)
-# Constants of a distribution, counts of coordinates, index patterns, stencils, units, codes of the system, colours.
-MORE_FACTS = re.compile(
-    r"MEDIAN_NORM|_ONE_SIGMA|ENTRY_OF_TURN|MEDIAN_TO_SIGMA|_RADIUS_95|UNKNOWN_TURN_RAD2|_THIRD_OF_A_TURN|QUARTER|_?FORWARD|"
-    r"POSITION_OUTPUTS|POSE_OUTPUTS|_ALLOWED_OUTPUTS|CORE_NUMBERS|_MOTIONS|_(FIXED|JOINT)_PARAMETERS|_CONSTANTS|_HARMONICS|"
-    r"_ROWS, _COLUMNS|_FIRST, _SECOND|_FACTORS|_STENCIL|_SLOPES|_FLIP|_MM|_UNITS|_?UNITS_PER_(METRE|SECOND)|"
-    r"TIME_ERROR|TIMEX_BYTES|TCGETS2, TERMIOS2|_PRIORITIES|WITH_RESTART_STEPS|_LARGEST_(COUNT|SEQ)|FIRST_ROW_LINE|"
-    r"_JOINTS, _MARKER|_GREY, _ORANGE|_STL_\w+|ERRORS|_HOMING_SIGN|PROTOCOL1, PROTOCOL2|HEADER, LARGEST_ID"
-)
-# In rooms that move data and compute no estimate: bounds against broken input, and how long loops and requests wait.
-OF_IO = ("cli", "daemon", "dashboard", "drivers", "fleet", "interfaces", "recordings", "robot", "sim_backend")
-BOUNDS = re.compile(r"(MOST|LARGEST|LONGEST|FARTHEST|SMALLEST|OLDEST|NEWEST|HEAVIEST|KEPT|SENDERS|NAMES|REMEMBERED)")
-WAITS = re.compile(
-    r"_?(\w*(EVERY|LIMIT|TIMEOUT|RETRY|READ|WAIT|PERIOD|TICK|IDLE|GLANCE|ANSWER|ASK|REST|CHECK|AFTER|END|POLL|LOOK|"
-    r"CONNECT|OPEN|LEASE|HEARTBEAT)\w*_M?S|NICENESS|ATTEMPTS|\w*PORT)$"
-)
 # Catalogues: one file an effect, which a new effect joins without another change.
 ONE_FILE_AN_EFFECT = ("diagnosis/report/presenters", "effects/catalogue")
+SETTINGS = re.compile(r"(Settings|Limits|Waits|Layout)$")
 QUESTIONS = re.compile(r"(Whether|What|How|Who)\b")
 
 
@@ -84,16 +45,10 @@ def numbers(tree: ast.Module) -> list[str]:
     ]
 
 
-def kind_of_number(file: Path, name: str) -> str:
-    """Classify a module-level number as "fact", "bound" or "wait"; all others are "tuned"."""
-    if str(file) in TABLES or FACTS.fullmatch(name.split(",")[0]) or MORE_FACTS.fullmatch(name):
-        return "fact"
-    if file.parts[0] in OF_IO:
-        if BOUNDS.match(name):
-            return "bound"
-        if WAITS.match(name.split(",")[0]):
-            return "wait"
-    return "tuned"
+def settings(tree: ast.Module) -> int:
+    """Count the numbers that are settings of an algorithm: fields of classes such as `_Settings` and `PairLimits`."""
+    groups = [node for node in tree.body if isinstance(node, ast.ClassDef) and SETTINGS.search(node.name)]
+    return sum(len(numbers(ast.Module(group.body, []))) for group in groups)
 
 
 def docstrings(tree: ast.Module) -> Iterator[str]:
@@ -155,7 +110,6 @@ def measures() -> dict[str, float | str]:
     largest, biggest = rooms.most_common(1)[0], flat.most_common(1)[0]
     crowded = next(found for found in flat.most_common() if found[0] not in ONE_FILE_AN_EFFECT)
     total = sum(lines.values())
-    kinds = Counter(kind_of_number(file, name) for file, tree in trees.items() for name in numbers(tree))
     pages = [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "results").glob("*.md")]
     users = [page for page in pages if page.name != "maths.md" and page.parent.name != "results"]
     return {
@@ -165,11 +119,8 @@ def measures() -> dict[str, float | str]:
         "import exceptions": sum(len(contract.get("ignore_imports", ())) for contract in contracts),
         "product lines": total,
         f"modules of up to {SMALL} lines with one importer": small_with_one_importer(files),
-        "numbers at the top of modules": kinds.total(),
-        "of these: facts of hardware, formats and mathematics": kinds["fact"],
-        "of these: bounds against broken input": kinds["bound"],
-        "of these: waits of loops and requests": kinds["wait"],
-        "of these: tuned": kinds["tuned"],
+        "numbers at the top of modules": sum(len(numbers(tree)) for tree in trees.values()),
+        "numbers in the settings of algorithms": sum(settings(tree) for tree in trees.values()),
         "docstrings that begin with a question": f"{_questions(texts):.1%}",
         "words in README": _words(ROOT / "README.md"),
         "words in the users' docs": sum(_words(page) for page in users),
