@@ -324,7 +324,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 def _large_tolerances(calibration: Calibration) -> list[str]:
     """Return a message if the geometric errors reach the largest that are considered, otherwise an empty list."""
-    made, (axes, points) = calibration.estimated_tolerances, ToleranceSettings.estimated_tolerances[-1]
+    made, (axes, points) = calibration.estimated_tolerances, ToleranceSettings.candidates[-1]
     if made is None or made.axes < axes:
         return []
     return [

@@ -179,7 +179,7 @@ class Calibration:
 
         The prior allows an arm of the widest tolerances.
         """
-        report, (axes, points) = self.learner.report(), ToleranceSettings.estimated_tolerances[-1]
+        report, (axes, points) = self.learner.report(), ToleranceSettings.candidates[-1]
         parameters = ChainParameters(self.placed.chain)
         before = ChainBelief.from_tolerances(parameters, replace(self.learner.tolerances, axes=axes, points=points))
         _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
@@ -267,7 +267,7 @@ def _tolerances(
     The frame's pose is a rotation about this origin and a shift: from afar, a small rotation of the arm is a long
     shift.
     """
-    links = ToleranceSettings.estimated_tolerances if trusted == "nothing" else ((0.0, 0.0),)
+    links = ToleranceSettings.candidates if trusted == "nothing" else ((0.0, 0.0),)
     free_zeros = trusted != "urdf"
     pose_known, marker_known = robot.camera.pose_known, robot.robot.marker_known
     fitted_place_m = max(_Settings.fitted_place_m, _Settings.fitted_turn_rad * distance_m)

@@ -159,7 +159,7 @@ def _tolerance_roots(parameters: ChainParameters) -> Iterator[FloatArray]:
     """Yield roots (p, k) of the covariance for each of the tolerances, and the same with one link of any length."""
     _, _, tangents, _, marker = parameters.tables
     joints = len(tangents)
-    for axes, points in ToleranceSettings.workmanship:
+    for axes, points in ToleranceSettings.candidates:
         tolerances = ChainTolerances(
             axes=axes,
             points=points,

@@ -186,7 +186,7 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
     wide = known.tolerances
     candidates = [(wide.axes, wide.points)]
     candidates += [
-        (axes, points) for axes, points in ToleranceSettings.workmanship if axes < wide.axes and points < wide.points
+        (axes, points) for axes, points in ToleranceSettings.candidates if axes < wide.axes and points < wide.points
     ]
     prior = known.nominal.belief(known.wide.parameters.reference, wide)
     belief = limited_to_exact_pairs(known.wide, prior, robot)

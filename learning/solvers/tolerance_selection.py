@@ -17,7 +17,7 @@ from kbmaps.robust import RobustSettings
 
 class ToleranceSettings:
     # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
-    select_tolerances = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
+    candidates = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
     compared_pairs = 100  # pairs at which candidates are compared with the posterior, evenly spread
     least_share = 0.01  # less probable tolerances are not considered
     # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
@@ -48,7 +48,7 @@ def select_tolerances(belief: ChainBelief, tolerances: ChainTolerances, q: Float
         The probable candidates, the narrowest last.
     """
     q = q[evenly_spread(len(q), ToleranceSettings.compared_pairs)]
-    order = reversed(ToleranceSettings.select_tolerances)
+    order = reversed(ToleranceSettings.candidates)
     candidates = [tolerances, *(each for selected in order for each in _narrower(tolerances, *selected))]
     narrowed = [belief.tightened(tolerances, each) for each in candidates]
     losses = _nonlinearity_loss(belief, [found for found, _ in narrowed], q)

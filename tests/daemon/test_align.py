@@ -55,7 +55,7 @@ def test_readings_too_far_apart_are_stale(buffer) -> None:
     assert buffer.at(0.05, 0.0) is Reason.STALE
 
 
-@pytest.mark.parametrize(("t_sigma", "slack"), [(0.0, 0.0), (0.002, 0.02)])
+@pytest.mark.parametrize(("t_sigma", "time_uncertainty_motion"), [(0.0, 0.0), (0.002, 0.02)])
 def test_slack_is_speed_times_time_sigma(buffer, t_sigma, time_uncertainty_motion) -> None:
     buffer.put(JointReading(0.0, frozen_array([0.0, 1.0]), t_sigma))
     buffer.put(JointReading(0.01, frozen_array([0.1, 1.0])))

@@ -19,7 +19,7 @@ LEARNER, SAMPLER = (learner.TABLES, learner.CHANGEABLE), (devices.TABLES, device
 
 
 @pytest.mark.parametrize(
-    ("process", "old", "new", "changed", "waiting"),
+    ("process", "old", "new", "changed", "needs_restart"),
     [
         (LEARNER, "side_sigma_m = 0.0001", "side_sigma_m = 0.001", [], ["vision.tag.side_sigma_m"]),
         (LEARNER, 'marker = "tag"', 'marker = "ball"', [], ["vision.marker"]),

@@ -13,7 +13,7 @@ import pytest
 from walked import DESK_ARM, walked
 
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.fit.observations import ticks
+from bodyschema.diagnosis.fit.observations import encoder_steps
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
@@ -53,7 +53,7 @@ def file(planted) -> DiagnosisFile:
 
 def advice_on(diagnosis: Diagnosis, file: DiagnosisFile) -> list[str]:
     robot = diagnosis.nominal.simulation.robot
-    return remedies(file, robot, ticks(diagnosis.extended.run.motion.q), np.zeros(len(robot.joints)))
+    return remedies(file, robot, encoder_steps(diagnosis.extended.run.motion.q), np.zeros(len(robot.joints)))
 
 
 @pytest.fixture(scope="module")

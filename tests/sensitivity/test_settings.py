@@ -14,13 +14,13 @@ from figures import Figures
 # By scene and class: the settings, and how far half or twice of each may move a figure of the scene.
 LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
     (figures.learner, "kbmaps.chains.rigid_fit._Settings"): {"scales_per_sigma": 0.01, "least_share": 0.01},
-    (figures.learner, "kbmaps.contest.ContestSettings"): {"worse": 0.01, "lately": 0.01, "cap": 0.01},
+    (figures.learner, "kbmaps.contest.ContestSettings"): {"worse_ratio": 0.01, "recent_pairs": 0.01, "cap": 0.01},
     (figures.learner, "kbmaps.maps.block_choice.BlockSettings"): {"first_precision": 0.01},
-    (figures.learner, "bodyschema.learning.changes.monitor.MonitorSettings"): {"fewest_known": 0.01},
+    (figures.learner, "bodyschema.learning.changes.monitor.MonitorSettings"): {"min_known": 0.01},
     (figures.learner, "bodyschema.learning.regime.RegimeSettings"): {
         "recent": 0.01,
-        "judged_late": 0.01,
-        "judged_anew": 0.01,
+        "max_late_pairs": 0.01,
+        "restart_share": 0.01,
     },
     (figures.learner, "bodyschema.learning.solvers.solver.SolverSettings"): {
         "shared": 0.02,

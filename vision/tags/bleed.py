@@ -36,7 +36,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
         blur_px: 1-sigma.
         modules: the tag's modules with its black border (n, n), 1 white and 0 black.
     """
-    prior = 0.0, (_Settings.total_variance * blur_px) ** 2
+    prior = 0.0, (_Settings.usual * blur_px) ** 2
     length = float(len(modules))
     to_px = cv2.getPerspectiveTransform(length * SQUARE, corners_px.astype(np.float32))
     sides = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1) / length
