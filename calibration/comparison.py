@@ -21,7 +21,7 @@ class _Settings:
     # Rows whose joints differ by more are not at the same joint angles [rad, m].
     same_angles = 1e-6
     worst_rows = 5
-    fewest_aligned = 4  # a rigid alignment of fewer points leaves no residual
+    min_aligned = 4  # a rigid alignment of fewer points leaves no residual
 
 
 class Distances(msgspec.Struct, frozen=True):
@@ -175,7 +175,7 @@ def _largest_difference(left_out: LeftOut) -> str:
 
 
 def _aligned(x: FloatArray, other: FloatArray) -> Aligned | None:
-    if len(x) < _Settings.fewest_aligned:
+    if len(x) < _Settings.min_aligned:
         return None
     moved, turn = aligned_to(x, other)
     angle = float(np.degrees(Rotation.from_matrix(turn).magnitude()))

@@ -24,7 +24,7 @@ from kbmaps import ChainParameters, ChainTolerances, DegenerateDataError, RigidC
 
 
 class LatencySettings:
-    fewest_fixes: int = 60
+    min_fixes: int = 60
     blocks: int = 10
     rival: float = 1.15  # a second minimum is a rival if its residual is below this multiple of the best one's
     apart_s: float = 0.03  # minimum distance of a rival
@@ -35,8 +35,8 @@ class LatencySettings:
     largest_sigma_s: float = 0.0025
     shortest_s: float = 3.0
     # required of the joint that moves most
-    least_turn_rad: float = np.radians(1.0)
-    least_slide_m: float = 0.005
+    min_turn_rad: float = np.radians(1.0)
+    min_slide_m: float = 0.005
     # required ratio of the marker's RMS motion to its part that does not follow the joints
     follows: float = 4.0
     little_m: float = 0.01
@@ -159,7 +159,7 @@ class _Fit:
         t = wiggle.t_marker
         inside = t - LatencySettings.latest_s - LatencySettings.step_s >= wiggle.t_joints[0]
         inside &= t - LatencySettings.earliest_s + LatencySettings.step_s <= wiggle.t_joints[-1]
-        if inside.sum() < LatencySettings.fewest_fixes:
+        if inside.sum() < LatencySettings.min_fixes:
             raise LatencyError(_too_few(wiggle, int(inside.sum())))
         centre = wiggle.q.mean(axis=0)
         _, size, directions = np.linalg.svd(wiggle.q - centre, full_matrices=False)
@@ -314,7 +314,7 @@ def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
     if len(wiggle.t_joints) < 2:
         raise LatencyError("there are no encoder readings")
     span = np.ptp(wiggle.q, axis=0)
-    if not (span > np.where(chain.prismatic, LatencySettings.least_slide_m, LatencySettings.least_turn_rad)).any():
+    if not (span > np.where(chain.prismatic, LatencySettings.min_slide_m, LatencySettings.min_turn_rad)).any():
         turned = np.degrees(span[~chain.prismatic])
         most = f"{turned.max():.1f}° at most" if len(turned) else f"{1e3 * span.max():.1f} mm at most"
         raise LatencyError(
@@ -351,12 +351,12 @@ def _strange(fit: _Fit, cost: float) -> str:
 
 def _too_few(wiggle: Wiggle, fixes: int) -> str:
     """Return the reason for too few fixes with known angles at every latency: short, slow or out of sight."""
-    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {LatencySettings.fewest_fixes} are needed"
+    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {LatencySettings.min_fixes} are needed"
     span_s = min(t[-1], wiggle.t_joints[-1]) - max(t[0], wiggle.t_joints[0])
     if span_s < LatencySettings.shortest_s:
         return f"{usable}: encoders and cameras looked on together for {max(span_s, 0.0):.1f} s only. Move for 5 s"
     rate_hz = 1.0 / max(float(np.quantile(np.diff(t), 0.1)), 1e-3)
-    earliest_s, latest_s, fewest = LatencySettings.earliest_s, LatencySettings.latest_s, LatencySettings.fewest_fixes
+    earliest_s, latest_s, fewest = LatencySettings.earliest_s, LatencySettings.latest_s, LatencySettings.min_fixes
     if rate_hz * (span_s - latest_s + earliest_s) < 1.2 * fewest:
         seconds = math.ceil(1.2 * fewest / rate_hz + latest_s - earliest_s)
         return (

@@ -41,7 +41,7 @@ class _Settings:
     # exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
     far_off, too_far_off = 3.0, 5.0
     # Share of outliers above which they are mentioned: trackers and tags get less wrong.
-    most_outliers: float = 0.1
+    max_outliers: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +309,7 @@ def _stamped_late(calibration: Calibration) -> list[str]:
 def _many_left_out(calibration: Calibration, first: int) -> list[str]:
     """Return a message, if any, on more outliers than an instrument has, or on consecutive outliers."""
     off = np.flatnonzero(~calibration.learner.inliers)
-    if len(off) <= _Settings.most_outliers * len(calibration.recording):
+    if len(off) <= _Settings.max_outliers * len(calibration.recording):
         return []
     runs = np.split(off, np.flatnonzero(np.diff(off) > 1) + 1)
     longest = max(runs, key=len) + first

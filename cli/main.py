@@ -110,7 +110,7 @@ def __getattr__(name: str) -> cyclopts.App:
 
 class _Settings:
     # A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
-    fewest_files, enough_files = 64, 1024
+    min_files, enough_files = 64, 1024
     longest_message: int = 4000  # a message may quote a file: a key in quotes, a name in a model
     # Help pages put text beside names: where no column is left for the text, wrapping fails or never ends.
     narrowest: int = 20
@@ -127,8 +127,8 @@ def allow_enough_files() -> None:
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = _Settings.enough_files if hard == resource.RLIM_INFINITY else min(hard, _Settings.enough_files)
-    if allowed < _Settings.fewest_files:
-        raise ConfigError(f"this process may open {hard} files and needs {_Settings.fewest_files}", remedy=RAISE_LIMIT)
+    if allowed < _Settings.min_files:
+        raise ConfigError(f"this process may open {hard} files and needs {_Settings.min_files}", remedy=RAISE_LIMIT)
     if soft != resource.RLIM_INFINITY and soft < allowed:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
 

@@ -87,8 +87,8 @@ class AppSettings:
     retry_ms: int = 1000  # delay after which a browser reconnects
     gzip_level: int = 5  # over a tunnel the page takes a quarter; higher levels take thrice the time for 3 % less
     # Requests for shapes that take a thread at once: reading meshes takes minutes, and the others need threads too.
-    most_for_shapes: int = 2
-    most_digits: int = 9  # of a mesh's number
+    max_for_shapes: int = 2
+    max_digits: int = 9  # of a mesh's number
 
 
 _JSON, _EVENTS, _BYTES = "application/json", "text/event-stream", "application/octet-stream"
@@ -110,7 +110,7 @@ class _Endpoints:
 
     def __init__(self, hub: Hub, processes: ProcessFollower, diagnoses: Diagnoses, shapes: Body) -> None:
         self._hub, self._processes, self._diagnoses, self._shapes = hub, processes, diagnoses, shapes
-        self._for_shapes = asyncio.Semaphore(AppSettings.most_for_shapes)
+        self._for_shapes = asyncio.Semaphore(AppSettings.max_for_shapes)
 
     async def index(self, _: Request) -> Response:
         return FileResponse(STATIC / "index.html")
@@ -144,7 +144,7 @@ class _Endpoints:
 
     async def mesh(self, request: Request) -> Response:
         number = request.path_params["number"]
-        if not (number.isascii() and number.isdigit() and len(number) <= AppSettings.most_digits):
+        if not (number.isascii() and number.isdigit() and len(number) <= AppSettings.max_digits):
             return Response(status_code=404)
         async with self._for_shapes:
             found = await run_in_threadpool(self._shapes.mesh, int(number))

@@ -22,7 +22,7 @@ from .watch import ProcessFollower
 
 
 class _Settings:
-    most_connections: int = 100  # at once
+    max_connections: int = 100  # at once
     end_limit_s: int = 3  # how long open requests may take to end
 
 
@@ -70,7 +70,7 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
                 log_config=None,
                 server_header=False,
                 proxy_headers=False,
-                limit_concurrency=_Settings.most_connections,
+                limit_concurrency=_Settings.max_connections,
                 timeout_graceful_shutdown=_Settings.end_limit_s,
             )
             logging.getLogger("uvicorn").setLevel(logging.WARNING)

@@ -37,13 +37,13 @@ MODULE = "bodyschema.dashboard.shapes"
 
 
 class _Settings:
-    most_triangles: int = 30_000  # a triangle takes at most 60 bytes, so all meshes together at most 1.8 MB
+    max_triangles: int = 30_000  # a triangle takes at most 60 bytes, so all meshes together at most 1.8 MB
     # Reading 256 MiB of text meshes takes minutes; the page is drawn without them meanwhile.
     read_limit_s: float = 180.0
-    most_memory_bytes: int = 2**31  # of the process that reads meshes
+    max_memory_bytes: int = 2**31  # of the process that reads meshes
     # Edges that are sharper than this stay sharp; a cylinder of 12 sides looks round.
     crease_cosine = float(np.cos(np.radians(32.0)))
-    most_neighbours: int = 24  # corners at one vertex whose normals are compared, so that no mesh takes long
+    max_neighbours: int = 24  # corners at one vertex whose normals are compared, so that no mesh takes long
 
 
 class LinkShapes(msgspec.Struct, frozen=True):
@@ -135,7 +135,7 @@ def read_shapes(urdf: Path) -> LinkShapes:
     Raises:
         RobotError: the URDF cannot be read.
     """
-    meshes, shapes = MeshSet(urdf, _Settings.most_triangles), link_shapes(parse_urdf(urdf))
+    meshes, shapes = MeshSet(urdf, _Settings.max_triangles), link_shapes(parse_urdf(urdf))
     named = [(shape.mesh, shape.sizes) for parts in shapes.values() for shape in parts if shape.kind == "mesh"]
     used = [number for each in named if (number := meshes.number_of(*each)) is not None]
     visible, before = meshes.coarser(used)
@@ -208,7 +208,7 @@ def _corner_normals(triangles: FloatArray, vertex: np.ndarray) -> FloatArray:
     order = np.argsort(vertex, kind="stable")
     vertices, face = vertex[order], order // 3
     sums = areas[face]
-    for step in range(1, min(_Settings.most_neighbours, len(order))):
+    for step in range(1, min(_Settings.max_neighbours, len(order))):
         here, there = face[:-step], face[step:]
         smooth = np.einsum("ij,ij->i", faces[here], faces[there]) > _Settings.crease_cosine
         alike = np.flatnonzero((vertices[:-step] == vertices[step:]) & smooth)
@@ -238,7 +238,7 @@ def main() -> None:
     """Write the shapes of the URDF named by the argument to standard output."""
     os.nice(NICENESS)
     try:
-        with bounded_memory(_Settings.most_memory_bytes):
+        with bounded_memory(_Settings.max_memory_bytes):
             found = read_shapes(Path(sys.argv[1]))
     except BodyschemaError as error:
         sys.exit(str(error))

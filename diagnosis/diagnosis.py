@@ -66,7 +66,7 @@ class DiagnosisSettings:
     there; `max_dof_share`, `same_noise`, `most_rows` and `run` were tried on three of them alone, none a long one.
     """
 
-    fewest_outliers = 3  # fewer outliers than this are not a finding
+    min_outliers = 3  # fewer outliers than this are not a finding
     min_outlier_evidence = 15.0  # smallest evidence gain for reporting outliers [nats]
     mostly = 0.8  # outliers count as motion-related if they occur on faster rows at least this often
     # Farther off than this, in units of the change by the path between two readings, the path cannot be the reason.
@@ -78,9 +78,9 @@ class DiagnosisSettings:
     max_dof_share = 0.9  # the fit absorbs at most this share of the noise
     same_noise = 0.1  # smallest change of the instrument's noise (in logarithms) that triggers a refit
     # In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
-    most_rows, run = 1000, 50
+    max_rows, run = 1000, 50
     # Rows before which the state is unknown are left out while most rows remain: a false jump may stand in for them.
-    most_doubtful = 0.5
+    max_doubtful = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class Diagnosis:
         """Return True if outliers are numerous and large enough to be a finding."""
         net_evidence = self.extended.noise.log_likelihood - self.extended.without_outliers
         named = (
-            self.outliers >= DiagnosisSettings.fewest_outliers and net_evidence > DiagnosisSettings.min_outlier_evidence
+            self.outliers >= DiagnosisSettings.min_outliers and net_evidence > DiagnosisSettings.min_outlier_evidence
         )
         return named and not self._outliers_where_fast() and not self._outliers_within_model_error()
 
@@ -418,10 +418,10 @@ def _searched_rows(begins: NDArray[np.bool_]) -> IntArray:
         begins: (n,), True in the first row after each break.
     """
     rows = len(begins)
-    if rows <= 2 * DiagnosisSettings.most_rows:
+    if rows <= 2 * DiagnosisSettings.max_rows:
         return np.arange(rows)
     breaks = np.convolve(begins[1:], np.ones(DiagnosisSettings.run - 1), "valid")
-    runs = DiagnosisSettings.most_rows // DiagnosisSettings.run
+    runs = DiagnosisSettings.max_rows // DiagnosisSettings.run
     firsts = np.linspace(0, rows - DiagnosisSettings.run, runs).astype(np.intp)
     for k, (first, after) in enumerate(pairwise(firsts.tolist())):
         firsts[k] += np.argmin(breaks[first : after - DiagnosisSettings.run + 1])
@@ -441,7 +441,7 @@ def _left_out(fit: Fit) -> NDArray[np.bool_]:
     If they are too many, return only the first ones; the arm is then assumed to go straight from each run to the next.
     """
     rows = fit.unknown_history()
-    return rows if rows.mean() <= DiagnosisSettings.most_doubtful else fit.unknown_history_at_first
+    return rows if rows.mean() <= DiagnosisSettings.max_doubtful else fit.unknown_history_at_first
 
 
 def _search(

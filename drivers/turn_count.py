@@ -17,7 +17,7 @@ LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed i
 
 
 class _Settings:
-    most_moved_deg: int = 30  # while nothing was read; beyond it the nearest turn may be another one
+    max_moved_deg: int = 30  # while nothing was read; beyond it the nearest turn may be another one
     look_again_s: float = 1.0  # period of checking if a joint was turned back
 
 
@@ -97,14 +97,14 @@ class TurnCount:
             if self._is_within_a_turn(place):
                 continue
             was, now = self.pose[place], sensor.angle(count)
-            if abs(now - was) > math.radians(_Settings.most_moved_deg) and self._is_accepted:
+            if abs(now - was) > math.radians(_Settings.max_moved_deg) and self._is_accepted:
                 log.warning("joint %r: at %.0f°, as a command stated", sensor.joint, math.degrees(now))
-            elif abs(now - was) > math.radians(_Settings.most_moved_deg):
+            elif abs(now - was) > math.radians(_Settings.max_moved_deg):
                 self.lost = sensor.joint
                 raise SourceLost(
                     f"joint {sensor.joint!r} ({sensor.label}) was at {math.degrees(was):.0f}° and is now at "
                     f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
-                    f"Turn it back to within {_Settings.most_moved_deg}° of where it was. If it really is at "
+                    f"Turn it back to within {_Settings.max_moved_deg}° of where it was. If it really is at "
                     f"{math.degrees(now):.0f}°: `bodyschema command accept_turns` while the sampler runs",
                     retry_s=_Settings.look_again_s,
                 )

@@ -40,7 +40,7 @@ ShapeSearch = Literal["none", "moment", "cycles", "width", "shape", "load"]
 class EffectSettings:
     # Largest step of a period or a time constant, as a share of it; largest change in one step.
     shape_step, shape_change = 0.3, 2.0
-    most_moments = 2  # two moments at one place are told apart; further ones are a drift
+    max_moments = 2  # two moments at one place are told apart; further ones are a drift
     step = 1e-6  # step of numerical derivatives [rad, m, or a parameter's unit]
 
 
@@ -177,7 +177,7 @@ class EffectType(ABC):
     @property
     def most_at_one_place(self) -> int:
         """Maximum of effects of this type at one place."""
-        return EffectSettings.most_moments if self.begins else 1
+        return EffectSettings.max_moments if self.begins else 1
 
     def is_free(self, robot: RobotDescription) -> bool:
         """Return True if it changes a parameter unknown to robot.toml: it is fitted first, and never a finding."""

@@ -22,7 +22,7 @@ Shift = Callable[[FloatArray], FloatArray]
 
 
 class _Settings:
-    most_harmonics, largest_net = 15, 3**12  # maximum of harmonics, and of control points of a net
+    max_harmonics, largest_net = 15, 3**12  # maximum of harmonics, and of control points of a net
     # Points along an axis and lines on which harmonics are sought; rows per batch.
     points, lines, rows = 64, 12, 4096
     largest_grid = 400_000  # maximum of grid points
@@ -136,7 +136,7 @@ def _axis(slides: bool, shift: Shift, q: FloatArray, joint: int, tolerance_m: fl
     lines = np.repeat(q[np.linspace(0, len(q) - 1, _Settings.lines).round().astype(int)], _Settings.points, axis=0)
     lines[:, joint] = np.tile(points, _Settings.lines)
     values = np.swapaxes(shift(lines).reshape(_Settings.lines, _Settings.points, 3), 0, 1).reshape(_Settings.points, -1)
-    for harmonics in range(_Settings.most_harmonics + 1):
+    for harmonics in range(_Settings.max_harmonics + 1):
         axis = replace(axis, harmonics=harmonics)
         functions = axis.functions(points)
         left = values - functions @ np.linalg.lstsq(functions, values, rcond=1e-10)[0]

@@ -29,7 +29,7 @@ from bodyschema.learning.status import ChainCalibration
 
 class _Settings:
     poses: int = 400
-    fewest_to_judge: int = 3  # with two robots, an outlier cannot be attributed to either
+    min_to_judge: int = 3  # with two robots, an outlier cannot be attributed to either
     # A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple
     # of both the models' predicted errors and the robots' median distance.
     far: float = 3.0
@@ -111,7 +111,7 @@ def compare_models(joints: tuple[str, ...], q: FloatArray, models: Sequence[Mode
     typical = float(np.median([each.rms_mm for each in apart]))
     claimed = float(np.median([1e3 * model.sigma_m for model in models]))
     figures = _figures(models)
-    can_judge = len(models) >= _Settings.fewest_to_judge
+    can_judge = len(models) >= _Settings.min_to_judge
     odd = [_outlying_figures(k, figures) if can_judge else () for k in range(len(models))]
     far = [_Settings.far * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
     units = tuple(
@@ -173,7 +173,7 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
         numbers = np.full((2, len(models)), np.nan)
         for k, (value, half_width) in of_robots.items():
             numbers[:, k] = value, half_width
-        if len(of_robots) >= _Settings.fewest_to_judge:
+        if len(of_robots) >= _Settings.min_to_judge:
             figures.append(_Figure(name, unit, *numbers))
     return figures
 
@@ -274,7 +274,7 @@ def sentences(comparison: TypeComparison) -> list[str]:
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "
         "model laid on their median as a whole."
     ]
-    if len(units) < _Settings.fewest_to_judge:
+    if len(units) < _Settings.min_to_judge:
         return [*lines, "Of two robots, it is not possible to say which is the odd one."]
     off = [unit for unit in units if unit.is_off]
     if not off:

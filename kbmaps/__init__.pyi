@@ -22,9 +22,6 @@ from kbmaps.changes.kinds import change_kinds as change_kinds
 from kbmaps.changes.kinds import explanations as explanations
 from kbmaps.changes.white_noise import SharedNoise as SharedNoise
 from kbmaps.changes.white_noise import WhiteNoise as WhiteNoise
-from kbmaps.contest import PrequentialComparison as PrequentialComparison
-from kbmaps.contest import Recent as Recent
-from kbmaps.contest import shared_by as shared_by
 from kbmaps.errors import BasisError as BasisError
 from kbmaps.errors import ChainError as ChainError
 from kbmaps.errors import DegenerateDataError as DegenerateDataError
@@ -67,6 +64,9 @@ from kbmaps.planning.expected_gain import ExpectedError as ExpectedError
 from kbmaps.planning.expected_gain import Forecast as Forecast
 from kbmaps.planning.expected_gain import candidate_motions as candidate_motions
 from kbmaps.planning.expected_gain import expected_gain as expected_gain
+from kbmaps.prequential import PrequentialComparison as PrequentialComparison
+from kbmaps.prequential import Recent as Recent
+from kbmaps.prequential import shared_by as shared_by
 from kbmaps.residual.learner import ResidualLearner as ResidualLearner
 from kbmaps.residual.model import ResidualModel as ResidualModel
 from kbmaps.robust import unexplained_variance as unexplained_variance

@@ -10,10 +10,10 @@ from kbmaps.robust import RobustSettings
 
 class _Settings:
     steps = 60  # number of steps towards the maximum likelihood; each increases it
-    least_share = 1e-9  # Lower bound of a variance as a share of all: it would vanish in rounding
+    min_share = 1e-9  # Lower bound of a variance as a share of all: it would vanish in rounding
     # Errors that the shares are estimated from, evenly spread: they determine four numbers to a few percent, and
     # weights that are wrong by so much cost a thousandth.
-    most_errors = 500
+    max_errors = 500
     alike_share = 1e-6  # variances of a covariance that differ by less than this share are the same
 
 
@@ -55,7 +55,7 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
         axis=1,
     )
     parts = parts[:, parts.any(axis=(0, 2, 3))]
-    sample = evenly_spread(len(errors), _Settings.most_errors)
+    sample = evenly_spread(len(errors), _Settings.max_errors)
     spread, units = in_typical_units(parts[sample], errors[sample])
     shares, _ = most_probable_shares(spread, errors[sample], leave_out=True)
     return np.einsum("k,nkij->nij", shares * units, parts) + RobustSettings.rounding_m**2 * np.eye(3)
@@ -89,7 +89,7 @@ def most_probable_shares(spread: FloatArray, off: FloatArray, *, leave_out: bool
         x, y, z = _turned_back(root, whitened * near)
         seen = parts @ np.concatenate([x * x, y * y, z * z, 2.0 * y * z, 2.0 * x * z, 2.0 * x * y])
         expected = parts @ (_inverse_of(root) * near).ravel()
-        shares = np.maximum(shares * np.sqrt(seen / expected), _Settings.least_share)
+        shares = np.maximum(shares * np.sqrt(seen / expected), _Settings.min_share)
     return shares, likelihood
 
 

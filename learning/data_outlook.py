@@ -60,7 +60,7 @@ class ResidualScatter:
         distances = np.linalg.norm(residuals, axis=1)
         # The part of the residuals that the fit absorbs equals its uncertainty at the same places.
         noise = math.hypot(MEDIAN_TO_SIGMA * float(np.median(distances)), math.sqrt(float(np.median(variance))))
-        noise = max(noise, FilterSettings.least_noise_m)
+        noise = max(noise, FilterSettings.min_noise_m)
         inliers = distances <= RobustSettings.outlier_sigmas * noise
         return cls(noise, int((~inliers).sum()), shared_by(residuals[inliers]))
 
@@ -76,7 +76,7 @@ def forecast(evidence: LearnerEvidence, scatter: ResidualScatter, joints: tuple[
     """
     rng = np.random.default_rng(0)  # the same pairs have the same outlook
     nominal, uncertainty = evidence.nominal, evidence.uncertainty
-    lower, upper = nominal.lower, np.maximum(nominal.upper, nominal.lower + FilterSettings.least_noise_m)
+    lower, upper = nominal.lower, np.maximum(nominal.upper, nominal.lower + FilterSettings.min_noise_m)
     floor = float(np.sqrt(np.square(uncertainty.in_sample).mean()))
     noise = scatter.noise_m * math.sqrt(scatter.shared)
     posterior = ChainPosterior.of_belief(evidence.belief, noise=max(noise, floor), floor=floor)

@@ -31,7 +31,7 @@ from kbmaps import ChainBelief, Recent
 
 class OnlineSettings:
     # Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
-    most_together, together_share = 25, 0.1
+    max_together, together_share = 25, 0.1
     # As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
     rounding_share = 1e-6
     feed_pairs = 256
@@ -79,7 +79,7 @@ class OnlineLearner:
     @property
     def belief(self) -> ChainBelief | None:
         """Posterior of the chain from the pairs with the current tool; None before the first solution."""
-        return self._regimes.claims.belief
+        return self._regimes.uncertainty.belief
 
     @property
     def aligning(self) -> bool:
@@ -135,7 +135,7 @@ class OnlineLearner:
         """
         with self._lock:
             regime, snapshot = self._regimes.current, self._snapshot
-            answering = None if regime is None else self._regimes.claims.errors.get(regime.answering)
+            answering = None if regime is None else self._regimes.uncertainty.errors.get(regime.answering)
             if (
                 regime is None or answering is None or answering.weight < UncertaintySettings.warm_pairs / 2
             ):  # the prior expectation counts more than the errors
@@ -175,18 +175,18 @@ class OnlineLearner:
         For the thread that calls `work`.
         """
         with self._lock:
-            regime, claims = self._regimes.current, self._regimes.claims
-            if regime is None or claims.belief is None or not self._solving.works_on(regime.task_number):
+            regime, uncertainty = self._regimes.current, self._regimes.uncertainty
+            if regime is None or uncertainty.belief is None or not self._solving.works_on(regime.task_number):
                 return None
             seen, *_ = regime.memory.spread_before(regime.memory.count, RegimeSettings.looked_back)
             known = self._solving.fed  # number of pairs that the solver knows
             q, x, _ = regime.memory.since(known - RegimeSettings.looked_back, RegimeSettings.looked_back)
             return LearnerEvidence(
                 nominal=self.nominal,
-                belief=claims.belief,
-                wide=claims.wide or claims.belief,
+                belief=uncertainty.belief,
+                wide=uncertainty.wide or uncertainty.belief,
                 tolerances=chain_tolerances(self._settings),
-                uncertainty=claims.of(regime.answering, regime.model.predict),
+                uncertainty=uncertainty.of(regime.answering, regime.model.predict),
                 solved=regime.answering in SOLVED,
                 pairs=self._counters.since_change,
                 region=self._region(regime),
@@ -228,7 +228,7 @@ class OnlineLearner:
                     self._pending_since = now
                 regime.learn_instantly(pair)
                 enough = max(int(OnlineSettings.together_share * regime.memory.count), 1)
-                enough = min(OnlineSettings.most_together, enough)
+                enough = min(OnlineSettings.max_together, enough)
                 if len(regime.pending) >= enough or self._is_learning_due(now):
                     self._learn_pending()
             self._publish()
@@ -456,14 +456,14 @@ class OnlineLearner:
         return replayed > 0
 
     def _publish(self) -> None:
-        regime, claims = self._regimes.current, self._regimes.claims
+        regime, uncertainty = self._regimes.current, self._regimes.uncertainty
         answering = PRIOR if regime is None else regime.answering
         self._snapshot = Snapshot(
             answering=answering,
             model=None if regime is None else regime.model,
             map=None if regime is None else regime.map,
-            uncertainty=claims.of(answering, None if regime is None else regime.model.predict),
-            support=claims.support,
+            uncertainty=uncertainty.of(answering, None if regime is None else regime.model.predict),
+            support=uncertainty.support,
             pairs=self._counters.pairs,
             newest_utc=self._newest_utc,
             waiting_for=self._waiting_for() if regime is None else "",

@@ -37,7 +37,7 @@ class OrientationSettings:
     # pairs.
     first_pairs = 64
     # Minimum number of pairs to trust the solved chain before it has predicted any.
-    fewest_to_trust = 3
+    min_to_trust = 3
 
 
 # Mean divided by RMS length of a Gaussian rotation vector with the same variance about each axis.
@@ -233,5 +233,5 @@ class Orientations:
     def _choose(self) -> None:
         self.answering = self._comparison.best(TRUSTED, self.answering)
         untested = RIGID in self._chains and not self._comparison.compares(RIGID)
-        if self.answering == PRIOR and self.pairs >= OrientationSettings.fewest_to_trust and untested:
+        if self.answering == PRIOR and self.pairs >= OrientationSettings.min_to_trust and untested:
             self.answering = RIGID

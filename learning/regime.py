@@ -347,7 +347,7 @@ class Regime:
 
     def _choose(self) -> None:
         self.answering = self._uncertainty.best(self.answering)
-        enough = self.memory.count >= OrientationSettings.fewest_to_trust
+        enough = self.memory.count >= OrientationSettings.min_to_trust
         if self.answering == PRIOR and enough and self._uncertainty.is_untested(RIGID):
             self.answering = RIGID  # the same, after some pairs
         self._choose_map()

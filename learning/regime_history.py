@@ -124,7 +124,7 @@ class Regimes:
         self._nominal, self._settings, self._task_numbers = nominal, settings, task_numbers
         self._fingerprint = nominal.fingerprint(chain_tolerances(settings))
         # uncertainties of its models, including experience from earlier regimes
-        self.claims = UncertaintyTracker(nominal.bases, EXPECTED_M)
+        self.uncertainty = UncertaintyTracker(nominal.bases, EXPECTED_M)
         self.fitting = Fitting(nominal, chain_tolerances(settings))  # fits of the frame or the tool as a whole
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)  # the pairs that wait for the first regime
         self.current: Regime | None = None  # the current regime; None before the frame is known
@@ -158,7 +158,7 @@ class Regimes:
         if (invalid_array := state.invalid_array()) is not None:
             raise StateError(f"it is of no use: {invalid_array} is not finite or too large")
         regimes.fitting.restore(header.next_fit, header.first_fit, arrays)
-        regimes.claims.restore(header.claims, arrays)
+        regimes.uncertainty.restore(header.claims, arrays)
         regimes.change = header.change
         if header.belief is None:
             regimes.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("cov"), arrays.get("turns"))
@@ -174,7 +174,7 @@ class Regimes:
         header = LearningHeader(
             fingerprint=self._fingerprint,
             counters=copy.copy(counters),
-            claims=copy.deepcopy(self.claims.state()),
+            claims=copy.deepcopy(self.uncertainty.state()),
             curve=curve.points,
             curve_stride=curve.stride,
             kept_of=self.memory.count,
@@ -182,7 +182,7 @@ class Regimes:
             first_fit=self.fitting.is_first,
             change=self.change,
         )
-        arrays = self.claims.arrays() | self.fitting.arrays() | {"q": q, "x": x}
+        arrays = self.uncertainty.arrays() | self.fitting.arrays() | {"q": q, "x": x}
         for name, values in (("cov", self.memory.cov_since(0)), ("turns", self.memory.turns_since(0))):
             if np.isfinite(values).any():
                 arrays[name] = values
@@ -283,9 +283,11 @@ class Regimes:
         self, regime: Regime, adapted: Adapted, q: FloatArray, x: FloatArray, cov: FloatArray, turns: FloatArray
     ) -> None:
         """Begin the regime that keeps everything except the changed part, with pairs q (n, d), x (n, 3) since then."""
-        inliers = inlier_mask(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
+        inliers = inlier_mask(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.uncertainty.noise_m)
         self.fitting.stop(adapted.belief.chain)
-        self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), regime.answering)
+        self.uncertainty.change_tool(
+            max(math.sqrt(3.0) * adapted.belief.noise, self.uncertainty.noise_m), regime.answering
+        )
         self.current = self._regime(adapted.prior, adapted.arm)
         self.current.learn_deferred(q[inliers], x[inliers], cov[inliers], turns[inliers], adapted.belief)
 
@@ -304,7 +306,7 @@ class Regimes:
     def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
         """Learn the pairs that waited for the frame, except those that contradict the fit."""
         (q, x), cov, turns = self.waiting.all(), self.waiting.cov_since(0), self.waiting.turns_since(0)
-        inliers = inlier_mask(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
+        inliers = inlier_mask(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.uncertainty.noise_m)
         self.waiting.clear()
         self.current = self._regime(fit.prior, self._nominal_arm(fit.chain))
         self.current.learn_deferred(q[inliers], x[inliers], cov[inliers], turns[inliers], belief)
@@ -314,9 +316,9 @@ class Regimes:
         self, regime: Regime, expected_m: float, first_fit: int = NominalSettings.pairs_to_refit
     ) -> Regime:
         """Return the regime of another tool, which begins where `regime` ends."""
-        prior, arm = regime.map, regime.arm.updated(self.claims.wide, self.claims.residual)
+        prior, arm = regime.map, regime.arm.updated(self.uncertainty.wide, self.uncertainty.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)
-        self.claims.change_tool(expected_m, regime.answering)
+        self.uncertainty.change_tool(expected_m, regime.answering)
         return self._regime(prior, arm.with_other_tool())
 
     def _is_tool_displacement(self, regime: Regime, pair: Pair) -> bool:
@@ -333,11 +335,11 @@ class Regimes:
     @property
     def _hand(self) -> RigidChain:
         """Chain with the best estimate of the hand's orientation."""
-        belief = self.claims.belief
+        belief = self.uncertainty.belief
         return self.fitting.chain if belief is None else belief.chain
 
     def _regime(self, prior: KBMap, arm: KnownArm) -> Regime:
-        return Regime(prior, arm, self.claims, self._settings, self._task_numbers)
+        return Regime(prior, arm, self.uncertainty, self._settings, self._task_numbers)
 
     def _nominal_arm(self, chain: RigidChain) -> KnownArm:
         return KnownArm(self._nominal.belief(chain, chain_tolerances(self._settings)), self._tolerances)

@@ -21,7 +21,7 @@ from bodyschema.learning.variance_terms import (
     VarianceTerm,
 )
 from kbmaps import ChainBelief, JointBasis, PrequentialComparison, Recent, ResidualModel, SupportSet
-from kbmaps.contest import ContestSettings
+from kbmaps.prequential import ContestSettings
 from kbmaps.robust import RobustSettings
 
 

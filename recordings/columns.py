@@ -43,7 +43,7 @@ class ColumnLimits:
     largest_segment = 2.0**53
     smallest_sigma_m, largest_sigma_m = 1e-100, 1e100  # their squares are still numbers
     # More columns than any arm needs, and ten hours at 100 samples/s with 27 columns.
-    most_columns, most_numbers = 1000, 100_000_000
+    max_columns, max_numbers = 1000, 100_000_000
     longest_name = 200
 
 
@@ -100,8 +100,8 @@ def check_joints(joints: tuple[str, ...]) -> None:
 
 def check_width(names: Sequence[str]) -> None:
     """Raise Fault when there are more columns than a recording can have."""
-    if len(names) > ColumnLimits.most_columns:
-        what = f"there are {len(names):,} columns; a recording has at most {ColumnLimits.most_columns:,}"
+    if len(names) > ColumnLimits.max_columns:
+        what = f"there are {len(names):,} columns; a recording has at most {ColumnLimits.max_columns:,}"
         raise Fault(what, remedy="Delete those that are none of a recording's")
     for name in names:
         if len(name) > ColumnLimits.longest_name:

@@ -19,7 +19,7 @@ FIRST_ROW_LINE = 2
 
 class _Settings:
     # Limits of a file and of a line: a thousand columns of 25 digits take 25 KiB.
-    most_bytes, most_line_bytes = 2**30, 2**20
+    max_bytes, max_line_bytes = 2**30, 2**20
     # Size of a parsed block: large enough to hide Python's overhead, small compared with the numbers of a recording.
     block_bytes = 2**22
 
@@ -33,7 +33,7 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
     """
     blocks: list[FloatArray] = []
     rows, whole = 0, True
-    with opened(file, _Settings.most_bytes) as stream:
+    with opened(file, _Settings.max_bytes) as stream:
         names = _header(stream)
         _check_header_line(names, joints)
         while data := _block(stream, rows):
@@ -43,8 +43,8 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
             except Fault as fault:
                 raise fault.moved(rows) from None
             rows += len(blocks[-1])
-            if rows * len(names) > ColumnLimits.most_numbers:
-                most = ColumnLimits.most_numbers // len(names)
+            if rows * len(names) > ColumnLimits.max_numbers:
+                most = ColumnLimits.max_numbers // len(names)
                 raise Fault(f"there are more than {most:,} rows of these columns", remedy="Cut the recording")
     if not rows:
         raise Fault("there are no rows below the header", remedy="Record at least one pair")
@@ -67,7 +67,7 @@ def csv_columns(file: Path) -> tuple[str, ...]:
         Fault: it is not text, or empty.
         OSError: it cannot be read.
     """
-    with opened(file, _Settings.most_bytes) as stream:
+    with opened(file, _Settings.max_bytes) as stream:
         names = _header(stream)
     check_width(names)
     return names
@@ -88,7 +88,7 @@ def _header(stream: BinaryIO) -> tuple[str, ...]:
         header = _lines(_decoded(line))[0] if line else ""
     except Fault as fault:
         raise fault.moved(-1) from None
-    if not header.strip() and not stream.read(_Settings.most_line_bytes).strip():
+    if not header.strip() and not stream.read(_Settings.max_line_bytes).strip():
         raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
     for letter in header:
         if not letter.isprintable() and letter != "\t":
@@ -107,8 +107,8 @@ def _block(stream: BinaryIO, row: int) -> bytes:
 
 
 def _line(stream: BinaryIO, row: int) -> bytes:
-    line = stream.readline(_Settings.most_line_bytes + 1)
-    if len(line) > _Settings.most_line_bytes:
+    line = stream.readline(_Settings.max_line_bytes + 1)
+    if len(line) > _Settings.max_line_bytes:
         raise Fault("the line is longer than 1 MiB", row=row, remedy="Name a CSV file")
     return line
 

@@ -181,7 +181,7 @@ def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, n
     if not files:
         raise RecordingError("the dataset has no data/**/*.parquet", file=source, remedy="Download it whole")
     states, times, episodes = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    left = most = ColumnLimits.most_numbers // (len(names) + len(_COLUMNS) - 1)
+    left = most = ColumnLimits.max_numbers // (len(names) + len(_COLUMNS) - 1)
     for file in files:
         try:
             with bounded_memory(FileLimits.memory_bytes), opened(file, MAX_BYTES) as stream:

@@ -58,7 +58,7 @@ def _read(arrow: Any, parquet: Any) -> Any:
 
     A file of some kilobytes can hold billions of equal numbers.
     """
-    most = ColumnLimits.most_numbers // len(parquet.schema_arrow)
+    most = ColumnLimits.max_numbers // len(parquet.schema_arrow)
     _check_rows(parquet.metadata.num_rows, most)
     batches, rows = [], 0
     for batch in parquet.iter_batches():

@@ -44,8 +44,8 @@ _NANO = 1_000_000_000
 
 class _Settings:
     # Of metadata.yaml, which is parsed at some 100 kB/s; a topic or a part of the bag takes 1 kB.
-    most_metadata_bytes = 2**20
-    most_said = 200  # characters of another library's message, which may quote the file
+    max_metadata_bytes = 2**20
+    max_said = 200  # characters of another library's message, which may quote the file
     first_messages = 200  # messages that are looked at to learn which joints or frames a topic has
 
 
@@ -144,7 +144,7 @@ def _opened(source: Path) -> Iterator[_Bag]:
         remedy = "Record the topics of joints and marker alone, or cut the bag: `ros2 bag convert`"
         raise RecordingError(what, file=source, remedy=remedy) from error
     except Exception as error:  # for damaged bytes rosbags may raise anything
-        message = (str(error).strip() or type(error).__name__).split("\n")[0][: _Settings.most_said].rstrip(".")
+        message = (str(error).strip() or type(error).__name__).split("\n")[0][: _Settings.max_said].rstrip(".")
         remedy = "A bag whose recording was cut off: `ros2 bag reindex`; one of splits: name the folder"
         raise RecordingError(f"the bag cannot be read: {message}", file=source, remedy=remedy) from error
 
@@ -154,7 +154,7 @@ def _check_files(source: Path) -> None:
     if not source.is_dir():
         check_regular(source)
         return
-    read_at_most(source / METADATA, _Settings.most_metadata_bytes)
+    read_at_most(source / METADATA, _Settings.max_metadata_bytes)
     for file in source.iterdir():
         if not file.is_dir():
             check_regular(file)

@@ -45,7 +45,7 @@ _BETWEEN = re.compile(r"[,=\[\]{}]")
 
 class _Settings:
     # The largest robot.toml of ours has 8 KiB. One MiB of keys takes 0.5 GB of memory at most.
-    most_bytes, most_parts = 2**20, 100
+    max_bytes, max_parts = 2**20, 100
 
 
 _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
@@ -64,7 +64,7 @@ def read_toml(
         ConfigError: it cannot be read; the message has the line.
     """
     try:
-        data = read_at_most(file, _Settings.most_bytes)
+        data = read_at_most(file, _Settings.max_bytes)
     except FileNotFoundError as error:
         raise ConfigError("there is no such file", file=file, remedy=written_by) from error
     except IsADirectoryError as error:
@@ -75,7 +75,7 @@ def read_toml(
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Fix its permissions") from error
     text = _decoded(data, file, damaged or "Name a robot.toml, or save it as UTF-8")
     if (line := line_of_endless_key(text)) is not None:
-        raise ConfigError(f"a key has more than {_Settings.most_parts} parts", file=file, line=line, remedy="Delete it")
+        raise ConfigError(f"a key has more than {_Settings.max_parts} parts", file=file, line=line, remedy="Delete it")
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
@@ -94,7 +94,7 @@ def line_of_endless_key(text: str) -> int | None:
     # Replace each string and comment by `q`; the number of lines stays the same.
     plain = _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
     for number, line in enumerate(plain.split("\n"), 1):
-        most = _Settings.most_parts
+        most = _Settings.max_parts
         if line.count(".") > most and any(piece.count(".") > most for piece in _BETWEEN.split(line)):
             return number
     return None

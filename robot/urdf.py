@@ -26,10 +26,10 @@ MOVING = REVOLUTE | {"prismatic"}
 
 
 class _Settings:
-    most_links = 2000  # a humanoid with hands has a few hundred
+    max_links = 2000  # a humanoid with hands has a few hundred
     # Realistic axes have length 1 and offsets of metres; squares of these bounds are far from overflow.
     shortest_axis, largest_place_m = 1e-9, 1e6
-    most_quoted = 60  # characters of a wrong attribute in a message: one line of a terminal
+    max_quoted = 60  # characters of a wrong attribute in a message: one line of a terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +339,7 @@ def _numbers(element: Any, attribute: str, default: tuple[float, ...], file: Pat
 
 
 def _short(text: str) -> str:
-    return repr(text if len(text) <= _Settings.most_quoted else text[: _Settings.most_quoted] + "...")
+    return repr(text if len(text) <= _Settings.max_quoted else text[: _Settings.max_quoted] + "...")
 
 
 def _owner(element: Any) -> str:
@@ -400,7 +400,7 @@ def parse_urdf(file: Path) -> Any:
         remedy = f"With ROS: `xacro {file.name} > made.urdf`, with the arguments that its makers document; then set "
         what = "this is a xacro file, of which a URDF is made first"
         raise _wrong(macro, file, what, f'{remedy}urdf = "made.urdf" in [robot]')
-    if sum(1 for _ in root.iter("link", "joint")) > 2 * _Settings.most_links:
-        what = f"the URDF has more than {_Settings.most_links:,} links"
+    if sum(1 for _ in root.iter("link", "joint")) > 2 * _Settings.max_links:
+        what = f"the URDF has more than {_Settings.max_links:,} links"
         raise RobotError(what, file=file, remedy="Keep the arm's alone")
     return root

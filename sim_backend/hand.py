@@ -12,8 +12,8 @@ from bodyschema.sim_backend.geometry import turn_between
 
 from .bullet import Body
 from .config import GuideConfig
-from .sight import Sight
 from .truth import JointRoles, TrueRobot, chain_from_root
+from .visibility import Sight
 
 
 class _Settings:
@@ -22,7 +22,7 @@ class _Settings:
     batch: int = 1000
     # of a batch: a tenth holds enough where the marker is in view at most postures
     at_once: int = 100
-    most_batches: int = 40
+    max_batches: int = 40
     # Share of a joint's range left free at either end.
     limit_margin: float = 0.04
     # Candidates for the next hop, and where along each the view is checked.
@@ -129,7 +129,7 @@ class GuidePath:
     def _visible_postures(self) -> FloatArray:
         """Sample postures (n, d) uniformly over the guided joints' ranges, and return those with a visible ball."""
         found: list[FloatArray] = []
-        for _ in range(_Settings.most_batches):
+        for _ in range(_Settings.max_batches):
             q = np.tile((self._lower + self._upper) / 2, (_Settings.batch, 1))
             q[:, self._guided] = self._rng.uniform(
                 self._lower[self._guided], self._upper[self._guided], (_Settings.batch, len(self._guided))

@@ -18,9 +18,9 @@ from bodyschema.sim_backend.hand import GuidePath, VirtualHand
 from bodyschema.sim_backend.physics_urdf import physics_urdf
 from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.scene import Scene, scene_of
-from bodyschema.sim_backend.sight import Gaze, Sight
 from bodyschema.sim_backend.sources import Encoders
 from bodyschema.sim_backend.truth import JointRoles, TrueRobot
+from bodyschema.sim_backend.visibility import Gaze, Sight
 
 
 class JointPaths:

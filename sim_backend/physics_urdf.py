@@ -32,7 +32,7 @@ WORLD_LINK = "bodyschema_world"
 
 
 class UrdfSettings:
-    most_links: int = 120  # pybullet's messages hold 128 joints
+    max_links: int = 120  # pybullet's messages hold 128 joints
     longest_name: int = 1000  # pybullet's messages hold 1024 bytes
     farthest_m: float = 100.0  # larger coordinates are not in metres
     heaviest_kg: float = 1e4  # the inertia of a heavier link is not believed
@@ -40,7 +40,7 @@ class UrdfSettings:
     rod_share, rod_radius_m, widest_rod_m, shortest_rod_m = 0.1, 0.005, 0.04, 0.01
     # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a
     # frame.
-    most_triangles: int = 8_000
+    max_triangles: int = 8_000
 
 
 _ROD_RGBA = "0.55 0.57 0.6 1"
@@ -92,9 +92,9 @@ class _Writer:
 
     def written(self) -> PhysicsUrdf:
         tree = self._truth.tree
-        if len(tree.links) > UrdfSettings.most_links:
+        if len(tree.links) > UrdfSettings.max_links:
             raise RobotError(
-                f"the simulation takes robots of up to {UrdfSettings.most_links} links, this one has {len(tree.links)}",
+                f"the simulation takes robots of up to {UrdfSettings.max_links} links, this one has {len(tree.links)}",
                 file=self._file,
                 remedy="Delete the links that neither carry the cameras nor the marker nor anything that is in the way",
             )
@@ -239,7 +239,7 @@ class Meshes(MeshSet):
     """The meshes of one URDF as files. Ask for each with `add`, then take all of them with `files`."""
 
     def __init__(self, urdf: Path) -> None:
-        super().__init__(urdf, UrdfSettings.most_triangles)
+        super().__init__(urdf, UrdfSettings.max_triangles)
         self._visual_numbers: list[int] = []
 
     def add(self, name: str, scale: tuple[float, ...], *, drawn: bool) -> str | None:

@@ -20,8 +20,8 @@ from bodyschema.sim_backend.physics_urdf import physics_urdf
 from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.render_client import RenderProcess
 from bodyschema.sim_backend.rendering.scene import Scene, scene_of
-from bodyschema.sim_backend.sight import Gaze, Sight
 from bodyschema.sim_backend.truth import JointRoles, TrueRobot
+from bodyschema.sim_backend.visibility import Gaze, Sight
 from kbmaps import RigidChain
 
 from .sources import Encoders, SimClock, SimJoints, SimStereoCamera
@@ -34,7 +34,7 @@ class _Settings:
     # Number of frames that are rendered ahead.
     ahead: int = 2
     batch: int = 500
-    most_batches: int = 400
+    max_batches: int = 400
     # How far the head may be turned away from the marker [rad]: with it the head's angles say more than where the hand
     # is.
     wander: float = np.radians(20.0)
@@ -168,7 +168,7 @@ def visible_postures(
     with Body(physics_urdf(truth), robot.joints) as body:
         looking = Gaze(robot, calibration, roles.gaze)
         sight = Sight(truth, calibration, roles, looking, body, config.camera)
-        for _ in range(_Settings.most_batches):
+        for _ in range(_Settings.max_batches):
             q = np.tile((robot.lower + robot.upper) / 2, (_Settings.batch, 1))
             q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_Settings.batch, len(guided)))
             q = sight.gazed(q)
@@ -178,6 +178,6 @@ def visible_postures(
             if len(found) >= count:
                 return np.array(found[:count])
     raise ConfigError(
-        f"the cameras see the marker in only {len(found)} of {_Settings.batch * _Settings.most_batches} postures",
+        f"the cameras see the marker in only {len(found)} of {_Settings.batch * _Settings.max_batches} postures",
         remedy="Check [camera] xyz and rpy, marker_xyz and the joint limits",
     )

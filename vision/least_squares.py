@@ -12,9 +12,9 @@ from bodyschema.interfaces.records import FloatArray
 
 class _Settings:
     # Most steps, and the relative decrease of the sum of squares that ends them: thousandths of a sigma.
-    most_steps, converged = 60, 1e-7
+    max_steps, converged = 60, 1e-7
     # Damping relative to the diagonal of the normal equations, at first and at most.
-    first_damping, most_damping = 1e-4, 1e12
+    first_damping, max_damping = 1e-4, 1e12
 
 
 class Linearised(Protocol):
@@ -37,14 +37,14 @@ def minimised(problem: P, stepped: Callable[[P, float], P | None]) -> P:
         stepped: returns the problem after a step with the given damping; None if there is no such step.
     """
     damping = _Settings.first_damping
-    for _ in range(_Settings.most_steps):
+    for _ in range(_Settings.max_steps):
         then = stepped(problem, damping)
         if then is not None and then.squares <= problem.squares:
             gained = problem.squares - then.squares
             problem, damping = then, 0.1 * damping
             if gained <= _Settings.converged * problem.squares:
                 break
-        elif (damping := 10.0 * damping) > _Settings.most_damping:
+        elif (damping := 10.0 * damping) > _Settings.max_damping:
             break
     return problem
 

@@ -41,7 +41,7 @@ class LimitSettings:
     # ... and a marker whose place is known, by ruler.
     known_tool_m: float = 0.01
     # Stroke that counts as one radian [m], and the minimum number of moves for a verdict.
-    a_radian_m, fewest_moves = 0.1, 20
+    a_radian_m, min_moves = 0.1, 20
 
 
 # Divisors that convert other units to metres.
@@ -147,7 +147,7 @@ def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) 
     inside = (gaps > 0.0) & (steps > 0.0)
     if recording.segment is not None and np.diff(recording.segment).any():
         inside &= np.diff(recording.segment) == 0
-    if inside.sum() < LimitSettings.fewest_moves:
+    if inside.sum() < LimitSettings.min_moves:
         return
     gap, speed = float(np.median(gaps[inside])), float(np.median(steps[inside] / gaps[inside]))
     if speed < LimitSettings.slowest:

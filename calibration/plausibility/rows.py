@@ -23,7 +23,7 @@ class _Settings:
     shifted: float = 0.12
     shifted_better: float = 5.0
     # Outliers are looked for among few rows: at most so many choices of rows are left out, each a fit of a few ms.
-    most_choices: int = 400
+    max_choices: int = 400
 
 
 def few_outliers(search: ReadingSearch, before: float) -> str:
@@ -33,7 +33,7 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
     """
     rows, joints = len(search.q), search.chain.joints
     most = rows - math.ceil(LimitSettings.measured_share * rows)
-    if math.comb(rows, most) > _Settings.most_choices:
+    if math.comb(rows, most) > _Settings.max_choices:
         return ""
     for off in range(1, most + 1):
         if 3 * (rows - off) <= joints + 9:

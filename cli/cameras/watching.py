@@ -79,7 +79,7 @@ BOUNDARY = "picture"
 
 
 class _Settings:
-    most_viewers: int = 32  # each browser that shows the pictures has its own thread here
+    max_viewers: int = 32  # each browser that shows the pictures has its own thread here
     end_check_s: float = 0.05  # how often the server looks for its end
 
 
@@ -105,7 +105,7 @@ class MjpegServer:
         self._number = 0
         self._changed = threading.Condition()
         self._is_closing = False
-        self._viewers = threading.BoundedSemaphore(_Settings.most_viewers)
+        self._viewers = threading.BoundedSemaphore(_Settings.max_viewers)
         self._server: _Server | None = None
 
     def __enter__(self) -> Self:
@@ -160,7 +160,7 @@ class MjpegServer:
                 elif self.path != "/stream":
                     self._say(404, "there is nothing here. The pictures are at /")
                 elif not server._viewers.acquire(blocking=False):
-                    self._say(503, f"{_Settings.most_viewers} browsers look on already. Close one")
+                    self._say(503, f"{_Settings.max_viewers} browsers look on already. Close one")
                 else:
                     try:
                         self._stream()

@@ -28,7 +28,7 @@ from kbmaps import rotation_matrices, rotation_vectors
 
 
 class _Settings:
-    most_too_far: float = 0.5  # share of the steps: with more it is no path
+    max_too_far: float = 0.5  # share of the steps: with more it is no path
     glance_s: float = 0.25  # interval of looking at the progress
     stall_limit_s: float = 120.0  # without progress
     # Live pairs come at most at the frame rate, and over some time: background learning is designed for that.
@@ -62,7 +62,7 @@ class Steps:
 
 def require_path(steps: Steps, recording: Recording) -> None:
     """Raise RecordingError if the rows are single poses far apart."""
-    if steps.too_far > _Settings.most_too_far * steps.count:
+    if steps.too_far > _Settings.max_too_far * steps.count:
         raise RecordingError(
             f"{steps}: these are single poses, not a guided path, and the sampler's step and speed rules do not "
             "apply to them",

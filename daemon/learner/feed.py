@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class FeedSettings:
-    most_waiting: int = 1024  # pairs that the learner has not taken
+    max_waiting: int = 1024  # pairs that the learner has not taken
     # Health reports a learner that is this many pairs behind: more than arrive in two or three seconds.
     behind: int = 100
 
@@ -100,7 +100,7 @@ class PairFeed:
     def offer(self, payload: bytes) -> None:
         """Accept a published pair."""
         self._published = payload, self._clock.now()
-        if self._waiting.qsize() < FeedSettings.most_waiting:
+        if self._waiting.qsize() < FeedSettings.max_waiting:
             self._waiting.put(payload)
         else:
             self._missed = True

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 class _Settings:
     share: float = 10.0  # findings take at most 1/share of a processor, which the robots share, and recur no more often
     every_s: float = 1.0  # shortest interval between two findings of a robot
-    least_probability: float = 0.01  # kinds less probable than this are not reported
+    min_probability: float = 0.01  # kinds less probable than this are not reported
 
 
 class FindingsBudget:
@@ -235,7 +235,7 @@ class Changes:
             probabilities={
                 self._kind_name(kind): round(kind.probability, 3)
                 for kind in change.kinds
-                if kind.probability > _Settings.least_probability
+                if kind.probability > _Settings.min_probability
             },
             alike=None if change.named is None else change.alike(change.named),
             moved_m=change.moved_m,

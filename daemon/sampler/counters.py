@@ -14,7 +14,7 @@ from bodyschema.robot.description import RobotDescription
 
 class _Settings:
     # A complaint needs nearly all of the newest frames (10 s of a usual camera; fewer at the start) to be refused.
-    newest_frames, fewest_frames, nearly_all = 300, 30, 0.9
+    newest_frames, min_frames, nearly_all = 300, 30, 0.9
 
 
 # An arm at rest, or paused by an operator, is in order. The other reasons have complaints of their own.
@@ -74,7 +74,7 @@ class SamplerCounters:
         """Complaint with main reason and remedy if nearly no frame becomes a pair; otherwise empty."""
         newest = tuple(self._newest)
         refused = Counter(reason for reason in newest if reason is not None)
-        if len(newest) < _Settings.fewest_frames or refused.total() < _Settings.nearly_all * len(newest):
+        if len(newest) < _Settings.min_frames or refused.total() < _Settings.nearly_all * len(newest):
             return []
         [(reason, count)] = refused.most_common(1)
         return [f"{count} of the last {len(newest)} frames were rejected: {WORDS[reason]}. {REMEDIES[reason]}"]

@@ -19,7 +19,7 @@ class _Settings:
     segment_gap_s: float = 1.0  # a longer pause between pairs starts a new segment
     # Joints that move farther while the time of a frame is uncertain (1-sigma, and what lies between the two eyes'
     # images) are too fast for a pair.
-    most_time_error_deg: float = 0.2
+    max_time_error_deg: float = 0.2
 
 
 class _Fix(NamedTuple):
@@ -86,7 +86,7 @@ class PairGate:
 
     def is_too_fast(self, moved: FloatArray) -> bool:
         """Return True if `moved` [rad or m] (d,), the motion within the time uncertainty, is too large for a pair."""
-        return float(np.linalg.norm(moved * self._degrees_per_unit)) > _Settings.most_time_error_deg
+        return float(np.linalg.norm(moved * self._degrees_per_unit)) > _Settings.max_time_error_deg
 
     def _is_plausible(self, fix: _Fix) -> bool:
         is_consistent = self._is_reachable(self._unconfirmed, fix)

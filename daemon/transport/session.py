@@ -33,7 +33,7 @@ class SessionSettings:
     open_timeout_s: float = 5.0  # how long opening waits for another process
     # Limits of messages that zenoh reassembles: the largest model with orientation for a client, pairs for a process.
     largest_reply_bytes, largest_message_bytes = 2**26, 2**23
-    most_refusals: int = 1000  # refusals waiting to be sent; beyond them a query ends without an answer
+    max_refusals: int = 1000  # refusals waiting to be sent; beyond them a query ends without an answer
     accept_limit_s: float = 1.0  # how long an endpoint is waited for to accept a connection
 
 
@@ -83,7 +83,7 @@ class ZenohSession:
         self._declared: list[object] = []  # a token without a reference is undeclared
         self._limiters: list[QueryLimiter[zenoh.Query]] = []
         self._threads: list[threading.Thread] = []
-        self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(SessionSettings.most_refusals)
+        self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(SessionSettings.max_refusals)
 
     def __enter__(self) -> Self:
         try:

@@ -34,7 +34,7 @@ from bodyschema.vision.tags.image import TagImage
 class _Settings:
     images: int = 20  # images during the observation
     # Largest difference of the printed size from the one given: a share, and sigmas on top of it.
-    most_grown, grown_sigmas = 0.01, 4.0
+    max_grown, grown_sigmas = 0.01, 4.0
 
 
 def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) -> str:
@@ -143,7 +143,7 @@ def measured(images: Images, calibration: Path, wanted: TagSelection, tell: Call
         views.append(ClusterView(pair.name, left, right))
     _require_tags(views, twice, wanted)
     found = measure_cluster(views, rectification.calibration, wanted.side_m, wanted.other_sides_m)
-    if abs(found.grown) > _Settings.most_grown + _Settings.grown_sigmas * found.grown_sigma:
+    if abs(found.grown) > _Settings.max_grown + _Settings.grown_sigmas * found.grown_sigma:
         raise CalibrationError(
             f"the black squares seem to be {1e3 * wanted.side_m * (1.0 + found.grown):.2f} mm wide, not "
             f"{1e3 * wanted.side_m:g}. Measure one and give --side-mm; or is this the calibration of other cameras?"

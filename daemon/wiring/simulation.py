@@ -63,7 +63,7 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
     """Raise ConfigError if the tracker does not find the marker even alone in front of a plain wall."""
-    from bodyschema.sim_backend.rendering.eye import ball_portraits
+    from bodyschema.sim_backend.rendering.stereo_renderer import ball_portraits
     from bodyschema.vision.trackers import tracker_of
 
     tracker, reasons = tracker_of(calibration, config.tables.vision), []

@@ -25,7 +25,7 @@ class _Settings:
     """
 
     margin = 8.0  # unnamed causes are accepted if they are more probable than named ones alone by this [nats]
-    most_unnamed = 3
+    max_unnamed = 3
     slack = 1.2  # safety factor on the first-order gain of several unnamed causes
     number = 3.0  # cost of each parameter of a named cause when sets of causes are compared [nats]
     # The imperfect shape of large causes is not an unnamed cause, up to a share of all causes, and a larger share of
@@ -267,7 +267,7 @@ def _with_unnamed(
     """Add worthwhile unnamed causes one by one; stop when the total is unlikely to reach `least` [nats]."""
     discrepancy_fit: FitWithDiscrepancy | None = None
     best_unnamed_gain, names = -np.inf, naming_cost(fit.causes, search)
-    while not fit.is_exact and (discrepancy_fit is None or len(discrepancy_fit.chosen) < _Settings.most_unnamed):
+    while not fit.is_exact and (discrepancy_fit is None or len(discrepancy_fit.chosen) < _Settings.max_unnamed):
         here, chosen = (fit, ()) if discrepancy_fit is None else (discrepancy_fit.fit, discrepancy_fit.chosen)
         near = unnamed.nearest(here, chosen, independence)
         prepared, more = near[0]
@@ -275,7 +275,7 @@ def _with_unnamed(
         discrepancy_cost = 0.0 if discrepancy_fit is None else unnamed.cost(discrepancy_fit)
         net_evidence = independence * here.log_likelihood - names - discrepancy_cost
         # Each remaining unnamed cause is worth hardly more than this one.
-        if net_evidence + _Settings.slack * (_Settings.most_unnamed - len(chosen)) * max(more, 0.0) < least:
+        if net_evidence + _Settings.slack * (_Settings.max_unnamed - len(chosen)) * max(more, 0.0) < least:
             break
         doubted = more < _Settings.beyond_doubt
         if more < WorthSettings.named_nats or (doubted and unnamed.evidence_from_blocks(here, chosen, prepared) < 0.0):

@@ -19,7 +19,7 @@ class NoiseSettings:
     Sensitivity: each at 0.3 and 3 times changes figures of seven recordings with hidden errors by 0.2 % at most.
     """
 
-    fewest_outliers = 1e-4  # share of outliers that are always expected
+    min_outliers = 1e-4  # share of outliers that are always expected
     # Most rounds of expectation maximisation, and the relative change of the noise that ends them.
     rounds, still = 6, 1e-6
     # Largest correlation of neighbouring rows that counts, and the largest that noise of an instrument is taken to
@@ -73,7 +73,7 @@ class Noise:
                 near = np.convolve(off, window)[len(window) // 2 :][: len(off)]
                 bursts = near > NoiseSettings.burst
                 weights[bursts] = 1.0
-            share = float(np.clip(1.0 - weights[trusted].mean(), NoiseSettings.fewest_outliers, 0.5))
+            share = float(np.clip(1.0 - weights[trusted].mean(), NoiseSettings.min_outliers, 0.5))
             weights[~trusted] = 0.0
             total = float(np.where(bursts, inlier, both)[trusted].sum())
             counted = max(3.0 * max(float(weights.sum()), 1.0) - effective_dof(sigma), 1.0)

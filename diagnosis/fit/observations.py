@@ -22,7 +22,7 @@ class _Settings:
     smallest_variance = 1e-4  # floor of a measured variance, as a share of the median one
     rows_a_run = 10  # shorter runs are single poses, not paths
     # Closer readings are equal; minimum of distinct gaps to find a step; tolerance around its multiples.
-    same_reading, fewest_gaps, off_a_multiple = 1e-9, 20, 0.02
+    same_reading, min_gaps, off_a_multiple = 1e-9, 20, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def encoder_steps(q: FloatArray) -> FloatArray:
     for k, column in enumerate(q.T):
         gaps: FloatArray = np.diff(np.unique(column))
         gaps = gaps[gaps > _Settings.same_reading]
-        if len(gaps) < _Settings.fewest_gaps:
+        if len(gaps) < _Settings.min_gaps:
             continue
         multiples = gaps / gaps.min()
         if np.abs(multiples - np.round(multiples)).max() < _Settings.off_a_multiple:

@@ -16,7 +16,7 @@ class _Settings:
     # Move beyond which the readings' noise does not matter, in multiples of it: a backlash needs only the direction of
     # the move, other effects its size.
     play_far, far = 4.0, 20.0
-    most_of_a_row_nats = 1.0  # largest evidence of one row for one memory effect over another [nats]
+    max_of_a_row_nats = 1.0  # largest evidence of one row for one memory effect over another [nats]
 
 
 def remembers(effect: Effect) -> bool:
@@ -60,7 +60,7 @@ def beyond_single_rows(one: Fit, other: Fit) -> float:
 
 def limited_rows(one: Fit, other: Fit) -> FloatArray:
     """Return the log-likelihood of `other` over `one` at each row (n,), with its weight limited [nats]."""
-    most = _Settings.most_of_a_row_nats
+    most = _Settings.max_of_a_row_nats
     return np.clip(other.row_log_likelihoods - one.row_log_likelihoods, -most, most)
 
 

@@ -283,7 +283,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     sentences = list(diagnosis.hypotheses.limitations)
     sided = [cause for cause in diagnosis.causes if cause.kind.by_direction]
     unknown_side = diagnosis.extended.unknown_history(sided).mean()
-    if unknown_side > DiagnosisSettings.most_doubtful:
+    if unknown_side > DiagnosisSettings.max_doubtful:
         joints = ", ".join(str(cause.where) for cause in sided)
         sentences.append(
             f"At {100.0 * unknown_side:.0f} % of the pairs it is unknown on which side of its backlash {joints} rests: "

@@ -52,7 +52,7 @@ _REDUNDANT = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
 
 
 class _Settings:
-    least_digits, most_digits = 0, 6
+    min_digits, max_digits = 0, 6
     # Half widths of an interval above which a length [m] or an angle [rad] is not identifiable.
     untold = (("_rad", 0.5), ("_m", 0.1))
     lopsided = 0.3  # an interval whose halves differ by more than this share is written with both its ends
@@ -178,7 +178,7 @@ def _digits(half: float) -> int:
     """Return the digits that give the half width two significant figures."""
     if half <= 0.0 or not math.isfinite(half):
         return 3
-    return min(max(1 - math.floor(math.log10(half)), _Settings.least_digits), _Settings.most_digits)
+    return min(max(1 - math.floor(math.log10(half)), _Settings.min_digits), _Settings.max_digits)
 
 
 def _fixed(value: float, digits: int, sign: str) -> str:

@@ -168,7 +168,7 @@ def _cell_means(cells: NDArray[np.intp], at: FloatArray, error: FloatArray) -> F
     arrows = [
         np.concatenate([at[rows].mean(axis=0), error[rows].mean(axis=0)])
         for rows in inside
-        if rows.sum() >= Layout.fewest_in_a_cell
+        if rows.sum() >= Layout.min_in_a_cell
     ]
     return np.array(arrows).reshape(-1, 4)
 
@@ -178,7 +178,7 @@ def histogram(residuals: Residuals) -> Panel:
     before, after = (1e3 * np.linalg.norm(e[residuals.rows], axis=1) for e in (residuals.before, residuals.after))
     noise = 1e3 * _noise(residuals)
     end = float(np.quantile(np.concatenate([before, after]), Layout.shown)) or 1.0
-    columns = int(np.clip(len(before) // Layout.pairs_a_column, Layout.fewest_columns, Layout.most_columns))
+    columns = int(np.clip(len(before) // Layout.pairs_a_column, Layout.min_columns, Layout.max_columns))
     edges = np.linspace(0.0, end, columns + 1)
     middle = 0.5 * (edges[1:] + edges[:-1])
     shares = {

@@ -19,7 +19,7 @@ class ResidualSettings:
     points, arrows = 450, 220  # maximum of points in a plot, and of arrows in a projection
     # A joint's rows count if it moves the marker by this share of its median effect.
     tells = 0.5
-    bins, fewest_in_a_bin = 16, 8
+    bins, min_in_a_bin = 16, 8
     significant = 1e-3  # a larger p-value counts as chance
 
 
@@ -169,7 +169,7 @@ def _members(x: FloatArray) -> NDArray[np.intp]:
     values, member = np.unique(np.round(x, 9), return_inverse=True)
     if len(values) <= ResidualSettings.bins:
         return member
-    bins = min(ResidualSettings.bins, max(len(x) // ResidualSettings.fewest_in_a_bin, 1))
+    bins = min(ResidualSettings.bins, max(len(x) // ResidualSettings.min_in_a_bin, 1))
     of_row = np.empty(len(x), dtype=np.intp)
     of_row[np.argsort(x, kind="stable")] = np.arange(len(x)) * bins // len(x)
     return of_row

@@ -21,9 +21,9 @@ class Layout:
     steps, ticks = (1.0, 2.0, 2.5, 5.0, 10.0), 5  # between ticks, and usual number of them
     min_explained_share = 0.02  # share of the error variance that a plot must explain to be shown at first
     cut = 0.01  # share of single errors at each end that does not set the range of a plot
-    cells, fewest_in_a_cell = (10, 6), 3
+    cells, min_in_a_cell = (10, 6), 3
     # Histogram: columns, the quantile of the errors at which it ends, and noise samples per row.
-    most_columns, fewest_columns, pairs_a_column, shown, drawn = 48, 12, 12, 0.99, 20
+    max_columns, min_columns, pairs_a_column, shown, drawn = 48, 12, 12, 0.99, 20
     side, margin = 300, 26  # of a view with arrows
     long, shorter = 0.1, 0.9  # arrow length as a share of the largest span, for the given quantile of the errors before
 

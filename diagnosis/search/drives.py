@@ -17,7 +17,7 @@ class _Settings:
     apart_turns = 0.75  # ripples whose phases differ by less over a joint's range are the same [turns]
     # Waves whose phases agree this well over all readings are the same wave.
     same_phase = 0.97
-    fewest_cycles = 2
+    min_cycles = 2
 
 
 def with_small_ripples(fit: Fit) -> Fit:
@@ -79,7 +79,7 @@ def aliases(fit: Fit, ripple: Effect) -> list[float]:
     """Return the other numbers of cycles per turn that look the same as a ripple's own at all readings."""
     q = fit.observations.motion.q[:, fit.simulation.place(ripple).joint]
     own = float(ripple.values[-1])
-    cycles = np.arange(_Settings.fewest_cycles, ScanSettings.finest_cycles + 1.0)
+    cycles = np.arange(_Settings.min_cycles, ScanSettings.finest_cycles + 1.0)
     # Compare waves of the same and of opposite phase; close neighbours of a ripple are not aliases.
     same = np.maximum(_agreement(cycles - own, q), _agreement(cycles + own, q)) > _Settings.same_phase
     separate = np.abs(cycles - own) > 2.0 * np.pi / max(float(np.ptp(q)), 1e-6)

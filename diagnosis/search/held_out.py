@@ -30,11 +30,11 @@ class HeldOutSettings:
     gain's interval; with `marker` above 1 no fix is left. Other `most_blocks` were not measured.
     """
 
-    most_blocks, folds = 80, 5  # of time; blocks are dealt to the folds in turn
+    max_blocks, folds = 80, 5  # of time; blocks are dealt to the folds in turn
     # Neighbours in time are alike for long, so a gain's interval rests on this many long parts of a recording.
     bootstraps, long_blocks = 2000, 10
     marker = 0.5  # a fix that is less probably the marker is left out of all figures
-    fewest_rows_a_block = 5
+    min_rows_a_block = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +45,9 @@ class Blocks:
     count: int  # number of blocks
 
     @classmethod
-    def cut(cls, rows: int, most: int = HeldOutSettings.most_blocks) -> Blocks:
+    def cut(cls, rows: int, most: int = HeldOutSettings.max_blocks) -> Blocks:
         """Cut rows into blocks of equal length, as many as reasonable."""
-        count = int(np.clip(rows // HeldOutSettings.fewest_rows_a_block, HeldOutSettings.folds, most))
+        count = int(np.clip(rows // HeldOutSettings.min_rows_a_block, HeldOutSettings.folds, most))
         return cls(np.arange(rows) * count // max(rows, 1), count)
 
     @property

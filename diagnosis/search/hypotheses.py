@@ -14,7 +14,7 @@ from bodyschema.effects import EFFECT_TYPES, Effect, EffectType, Simulation
 class HypothesisSettings:
     # A joint that moves less than this cannot be tested [rad, m].
     still = 1e-4
-    fewest_rows = 20
+    min_rows = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,4 +105,4 @@ class _Limits:
             return True
         if kind.needs_stereo and robot.calibration is None:
             return True
-        return len(self._motion) < HypothesisSettings.fewest_rows
+        return len(self._motion) < HypothesisSettings.min_rows

@@ -33,12 +33,12 @@ class ScanSettings:
 
     between = 2.5  # largest loss factor halfway between two shapes tried: for waves, one over sinc² of a half
     coarse = 5  # effective number of independent shapes of a smooth family
-    most_moments = 1000  # number of moments tried first, before all those next to the best
+    max_moments = 1000  # number of moments tried first, before all those next to the best
     beside = 8  # minimum of rows on either side of a moment
     bent = 0.1  # share of the noise by which an effect has to differ from its first order to be evaluated beyond it
     # Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per
     # turn of a strain wave gear of 120, are searched as coarsely as they can be resolved.
-    most_cycles, finest_cycles = 100, 240
+    max_cycles, finest_cycles = 100, 240
 
 
 # Index of the best choice, gains (m,), its amounts (k,) and degrees of freedom.
@@ -249,13 +249,13 @@ class Scan:
         place = self._fit.simulation.place(effect)
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
-        coarse: FloatArray = np.asarray(first + step * np.arange(ScanSettings.most_cycles - 1), dtype=np.float64)
+        coarse: FloatArray = np.asarray(first + step * np.arange(ScanSettings.max_cycles - 1), dtype=np.float64)
         # The width of a peak is the change that shifts the phase by one turn over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
         bands = [coarse]
         if not place.prismatic:
-            apart = max(min(width, 0.1 * (ScanSettings.finest_cycles - ScanSettings.most_cycles)), step)
-            bands.append(np.arange(ScanSettings.most_cycles + 1.0, ScanSettings.finest_cycles, apart))
+            apart = max(min(width, 0.1 * (ScanSettings.finest_cycles - ScanSettings.max_cycles)), step)
+            bands.append(np.arange(ScanSettings.max_cycles + 1.0, ScanSettings.finest_cycles, apart))
         tried, cycles = max(((self._best_ripple(effect, band), band) for band in bands), key=_best_gain)
         if width < step or self._gain_of_squares(float(tried[1][tried[0]]), ScanSettings.between) >= least:
             fine: FloatArray = cycles[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
@@ -299,7 +299,7 @@ class Scan:
             columns = self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts])
             return self._products.step_systems(columns, rows)
 
-        step = 1 + n // ScanSettings.most_moments
+        step = 1 + n // ScanSettings.max_moments
         some = range(ScanSettings.beside, n - ScanSettings.beside, step)
         best, gains, amounts, dof = self._best(self._products.cached(effect, lambda: step_systems(some)), effect)
         if not dof:

@@ -39,9 +39,9 @@ class _Settings:
     near, most = 0.4, 6  # candidates within this share of the best gain are refitted, up to this number
     worth_in_full = 0.2  # candidates within this share of the best gain are evaluated beyond first order
     # With more causes than this, the error has been described and not explained; maximum of steps of the search.
-    most_causes, most_steps = 12, 20
-    most_moments = 3  # more jumps, slips and bumps than this in one recording describe something that comes and goes
-    most_sets = 60  # maximum of sets of causes to examine; none is examined twice
+    max_causes, max_steps = 12, 20
+    max_moments = 3  # more jumps, slips and bumps than this in one recording describe something that comes and goes
+    max_sets = 60  # maximum of sets of causes to examine; none is examined twice
     # Multiple of a limit, and the margin to it [nats], beyond which the first order decides.
     # With 0.3 to 3 times these, three recordings had the same causes, probabilities to 0.001 and RMS to 0.01 %.
     clearly, at_least = 2.0, 10.0
@@ -185,9 +185,9 @@ class Search:
             fit = self._review(start)
             self._append_to_path(fit)
         while (
-            len(self.path) <= _Settings.most_steps
-            and len(fit.causes) <= _Settings.most_causes
-            and len(self._seen) < _Settings.most_sets
+            len(self.path) <= _Settings.max_steps
+            and len(fit.causes) <= _Settings.max_causes
+            and len(self._seen) < _Settings.max_sets
         ):
             added = self._add_cause(fit)
             if added is None or (causes := cause_counts(added.causes)) in self._seen:
@@ -196,8 +196,8 @@ class Search:
             self._seen.add(causes)
             fit = self._review(added)
             self._append_to_path(fit)
-        is_long = len(self.path) > _Settings.most_steps or len(self._seen) >= _Settings.most_sets
-        self.ended_early = is_long or len(fit.causes) > _Settings.most_causes
+        is_long = len(self.path) > _Settings.max_steps or len(self._seen) >= _Settings.max_sets
+        self.ended_early = is_long or len(fit.causes) > _Settings.max_causes
         return fit
 
     def _append_to_path(self, fit: Fit) -> None:
@@ -334,7 +334,7 @@ class Search:
     def _review(self, fit: Fit) -> Fit:
         """Review one cause after another, until each was reviewed after the last change that may concern it."""
         waiting = [cause.identity for cause in fit.causes]
-        while waiting and len(self._seen) < _Settings.most_sets:
+        while waiting and len(self._seen) < _Settings.max_sets:
             cause = next(effect for effect in fit.causes if effect.identity == waiting[0])
             better = None if self._has_clear_lead(fit, cause) else self._reconsider(fit, cause)
             later = waiting[1:]
@@ -472,7 +472,7 @@ def contains(fit: Fit, link: Effect, zero: Effect) -> bool:
 
 def are_only_descriptive(causes: Sequence[Effect]) -> bool:
     """Return True if causes only describe the error: too many of them begin at a moment."""
-    return sum(cause.kind.begins for cause in causes) > _Settings.most_moments
+    return sum(cause.kind.begins for cause in causes) > _Settings.max_moments
 
 
 def complexity(effect: Effect) -> int:

@@ -47,7 +47,7 @@ class SetSettings:
     ruled_out_nats, finer = 1.35, 0.2
     # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not
     # enough.
-    most_moves, most_together = 60, 8
+    max_moves, max_together = 60, 8
     comes_near_nats = 15.0  # margin to the best within which a set is refitted, and a change tried [nats]
 
 
@@ -200,12 +200,12 @@ class CauseSets:
 
     def _hill_climb(self, start: tuple[int, ...], seen: dict[frozenset[int], CauseSet]) -> CauseSet:
         current = self.of(start)
-        for _ in range(SetSettings.most_moves):
+        for _ in range(SetSettings.max_moves):
             if frozenset(current.chosen) in seen:
                 return seen[frozenset(current.chosen)]
             seen[frozenset(current.chosen)] = current
             better = self._without_one(current)
-            if better is None and len({self.effects[k].identity for k in current.chosen}) < SetSettings.most_together:
+            if better is None and len({self.effects[k].identity for k in current.chosen}) < SetSettings.max_together:
                 better = (
                     self._with_one_more(current) or self._exchanged(current) or self._with_smaller_tolerances(current)
                 )

@@ -28,7 +28,7 @@ from .sets import SCALES, CauseSet, CauseSets, SetSettings
 
 
 class _Settings:
-    most_refitted = 8  # maximum of refitted sets
+    max_refitted = 8  # maximum of refitted sets
     # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a
     # jump.
     followed_share = 0.1
@@ -56,7 +56,7 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         tell: called with short messages on progress.
     """
     known = [_Linearisation(start.with_tolerances(Scales()), hypotheses, ())]
-    while len(known) < _Settings.most_refitted:
+    while len(known) < _Settings.max_refitted:
         visits = Counter(linearisation.name for linearisation in known)
         best = max(known, key=lambda linearisation: linearisation.current.net_evidence)
         # A set fitted far from its own parameters is fitted once more, from where it seems better than all.

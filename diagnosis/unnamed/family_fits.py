@@ -351,7 +351,7 @@ class UnnamedFamilies:
         rows = len(alone.observations)
         # Functions of time cannot be extrapolated over long blocks.
         timed = any(prepared.family.over_time for prepared in discrepancy_fit.chosen)
-        blocks = Blocks.cut(rows, rows // HeldOutSettings.fewest_rows_a_block) if timed else Blocks.cut(rows)
+        blocks = Blocks.cut(rows, rows // HeldOutSettings.min_rows_a_block) if timed else Blocks.cut(rows)
         return self._missed(discrepancy_fit.fit, blocks, discrepancy_fit) <= FamilySettings.no_worse * self._missed(
             alone, blocks
         )

@@ -24,7 +24,7 @@ class _Settings:
     # Loose from here on: distance of the two sides in standard deviations about each, worth of two sides over one
     # [nats], and width along the play over the width across it.
     apart, named, beyond_noise = 3.0, 15.0, 2.5
-    least_across = 1e-5  # of the width along it: with less, covariances cannot be inverted
+    min_across = 1e-5  # of the width along it: with less, covariances cannot be inverted
     rounds = 50  # of expectation maximisation
     fits, same = 30, 1.0  # most fits beside a play, and the gain in likelihood that ends them [nats]
     # Cost of a play [nats]: it has no name, and three numbers, as a slip has. From 5 to 90, the verdicts on 17
@@ -109,7 +109,7 @@ def _estimated_play(fit: Fit) -> LooseMarker | None:
         sides = np.where(_changing_side(sides), 0.0, sides)
     net_evidence += alike
     half = 0.5 * float(means[1] - means[0])
-    ratio = float(variances[2] / max(variances[:2].mean(), _Settings.least_across**2 * variances[2])) - 1.0
+    ratio = float(variances[2] / max(variances[:2].mean(), _Settings.min_across**2 * variances[2])) - 1.0
     rarer = min(int((sides[rows] < 0.0).sum()), int((sides[rows] > 0.0).sum()))
     is_clear = (
         2.0 * half >= _Settings.apart * sigma

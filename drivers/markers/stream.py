@@ -40,7 +40,7 @@ class _Settings:
     restart: int = 3
     few_per_s: float = 15.0
     farthest_m: float = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
-    most_senders: int = 64  # whose sequence numbers are kept
+    max_senders: int = 64  # whose sequence numbers are kept
     read_s: float = 2.5  # until the clock of the stamps is known to milliseconds
 
 
@@ -288,7 +288,7 @@ class MarkerStream:
             return None
         numbers = self._numbers.get(packet.sender)
         if numbers is None:
-            if len(self._numbers) >= _Settings.most_senders:
+            if len(self._numbers) >= _Settings.max_senders:
                 self._numbers.clear()
             numbers = self._numbers[packet.sender] = _Numbers()
         lost, order = numbers.count(seq, self._unread)

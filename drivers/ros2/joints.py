@@ -27,11 +27,11 @@ from bodyschema.interfaces.waits import Waits
 
 class _Settings:
     points_kept: int = 4096  # of each joint
-    most_shown: int = 12  # names in a message
+    max_shown: int = 12  # names in a message
     slack_rad, slack_m = 0.02, 2e-3  # on top of what the fastest joint moves between two messages
-    most_gap_s: float = 0.1  # no position is interpolated between two messages of a joint that are farther apart
-    most_senders: int = 64  # that are kept apart
-    most_names: int = 256  # upper bound of the names kept for messages
+    max_gap_s: float = 0.1  # no position is interpolated between two messages of a joint that are farther apart
+    max_senders: int = 64  # that are kept apart
+    max_names: int = 256  # upper bound of the names kept for messages
     few_per_s: float = 20.0  # readings: fewer get a warning
 
 
@@ -145,7 +145,7 @@ def silence(
         why, count = refused.most_common(1)[0]
         return f"nothing of {config.topic} can be used; {count} times: {ADVICE[why]}"
     if names and missing:
-        there = ", ".join(sorted(names)[: _Settings.most_shown])
+        there = ", ".join(sorted(names)[: _Settings.max_shown])
         return (
             f"{config.topic} does not name {', '.join(missing)}; it names {there}. "
             "Say in [drivers.ros2] names what ROS calls each joint"
@@ -171,7 +171,7 @@ def _why_unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
     elsewhere = sorted({topic.domain for topic in topics if topic.name == name})
     if elsewhere:
         return f"{name} is published in the domain {elsewhere[0]}, not {config.domain}; fix domain"
-    others = sorted({topic.name for topic in in_domain if topic.type == JOINT_STATE.name})[: _Settings.most_shown]
+    others = sorted({topic.name for topic in in_domain if topic.type == JOINT_STATE.name})[: _Settings.max_shown]
     if others:
         return f"nothing publishes {name}; there are joint states on {', '.join(others)}. Fix topic"
     return (
@@ -280,12 +280,12 @@ class Ros2Joints:
             return None
         gid, sequence = rmw.sender_of(sample.attached)
         self._count_lost(gid, sequence)
-        if len(self._names) < _Settings.most_names:
+        if len(self._names) < _Settings.max_names:
             self._names.update(message.names)
         merged = self._accepted(gid or message.names, message, sample.arrived)
         if merged is None:
             return None
-        if merged.gap_s > _Settings.most_gap_s:
+        if merged.gap_s > _Settings.max_gap_s:
             self._refuse(Refusal.GAP, f"{merged.gap_s:.3f} s")
             return None
         if merged.t <= self._last_t:
@@ -339,7 +339,7 @@ class Ros2Joints:
     def _sender(self, who: SenderKey) -> Sender:
         sender = self._senders.get(who)
         if sender is None:
-            if len(self._senders) >= _Settings.most_senders:
+            if len(self._senders) >= _Settings.max_senders:
                 del self._senders[min(self._senders, key=lambda known: self._senders[known].heard)]
             self._senders[who] = sender = Sender(self._config.max_delay_s)
         return sender
@@ -350,7 +350,7 @@ class Ros2Joints:
         before = self._sequences.get(gid)
         if before is not None and sequence > before + 1:
             self.lost += sequence - before - 1
-        if before is not None or len(self._sequences) < _Settings.most_senders:
+        if before is not None or len(self._sequences) < _Settings.max_senders:
             self._sequences[gid] = sequence
 
     def _refuse(self, why: Refusal, detail: str) -> None:

@@ -22,7 +22,7 @@ from .messages import JOINT_STATE
 
 class LinkSettings:
     retry_s: float = 0.5  # asking for an absent router is cheap
-    most_waiting: int = 4096  # messages: four seconds at 1 kHz
+    max_waiting: int = 4096  # messages: four seconds at 1 kHz
     graph_limit_s: float = 1.0  # how long the list of publishers is waited for
 
 
@@ -98,7 +98,7 @@ class ZenohLink:
     def __init__(self, session: zenoh.Session, key: str, clock: Clock) -> None:
         """Subscribe to `key`; the session is closed with the link."""
         self._session, self._clock = session, clock
-        self._waiting: queue.Queue[Sample] = queue.Queue(LinkSettings.most_waiting)
+        self._waiting: queue.Queue[Sample] = queue.Queue(LinkSettings.max_waiting)
         # In zenoh's own thread, so that the time of arrival does not depend on the reader.
         handler = zenoh.handlers.Callback(self._take, indirect=False)
         self._subscriber = session.declare_subscriber(key, handler)

@@ -31,7 +31,7 @@ class _Settings:
     recent_requests: int = 4
     longest_noise_s: float = 0.25  # how long a bus is waited for to fall quiet
     # bytes: from the end of a reading's block to that of the documented registers of the X and P series
-    most_spare_bytes: int = 10
+    max_spare_bytes: int = 10
 
 
 Taken = TypeVar("Taken")
@@ -373,4 +373,4 @@ class Inbox:
 
 def spare_after(layout: Layout, register: Register) -> int:
     """Return how many bytes after a register may be read together with it."""
-    return min(_Settings.most_spare_bytes, layout.size - register.end)
+    return min(_Settings.max_spare_bytes, layout.size - register.end)

@@ -14,7 +14,7 @@ from bodyschema.interfaces.records import FloatArray
 
 class _Settings:
     of_a_peak_rad = 0.5  # largest step of the phase over the joint's range [rad]
-    fewest_cycles = 1.5  # at once per turn it would be an eccentricity
+    min_cycles = 1.5  # at once per turn it would be an eccentricity
 
 
 class JointRipple(EncoderEffect):
@@ -47,7 +47,7 @@ class JointRipple(EncoderEffect):
         return _Settings.of_a_peak_rad / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
-        return super().bounded(effect, k, value if effect.prismatic else max(value, _Settings.fewest_cycles), motion)
+        return super().bounded(effect, k, value if effect.prismatic else max(value, _Settings.min_cycles), motion)
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
         sine, cosine, cycles = effect.values.tolist()

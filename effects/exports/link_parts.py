@@ -25,10 +25,10 @@ _MESHES = (".stl", ".obj", ".msh")
 
 
 class PartSettings:
-    most_triangles = 200_000
+    max_triangles = 200_000
     rod_radius_m, shortest_rod_m = 0.02, 0.01  # a link without a shape becomes a rod from its joint to the next one [m]
     # Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
-    least_inertia_kgm2 = 1e-9
+    min_inertia_kgm2 = 1e-9
 
 
 _GREY = "0.7 0.7 0.72 1"
@@ -131,7 +131,7 @@ def _inertia(inertial: Any) -> FloatArray:
         T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
         T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
     R = T[:3, :3] @ axes
-    return R @ np.diag(np.maximum(moments, PartSettings.least_inertia_kgm2)) @ R.T
+    return R @ np.diag(np.maximum(moments, PartSettings.min_inertia_kgm2)) @ R.T
 
 
 def _floats(text: str) -> FloatArray:
@@ -149,4 +149,4 @@ def _readable(file: Path) -> bool:
         return False
     (triangles,) = struct.unpack("<I", head[-4:])
     size = STL_HEAD_BYTES + STL_TRIANGLE.itemsize * triangles
-    return 0 < triangles <= PartSettings.most_triangles and file.stat().st_size == size
+    return 0 < triangles <= PartSettings.max_triangles and file.stat().st_size == size

@@ -44,7 +44,7 @@ class _Settings:
     # Rates [rad/s] of actuators and of unloaded springs: well below 1/step_s, so that the integrator follows.
     servo_rate, spring_rate = 100.0, 60.0
     # Friction as a multiple of gravity's largest torque: backlash shows only if the weight does not close it.
-    friction_margin, least_friction = 2.0, 0.1
+    friction_margin, min_friction = 2.0, 0.1
     postures = 256  # in which that torque is sought
     # The distance of a point this far [m] from a circle of this radius [m] is a sine of the angle, to 1 in 2,000.
     wave_anchor, wave_radius = 1.0, 0.001
@@ -148,7 +148,7 @@ class _Document:
             inertiafromgeom="false",
             balanceinertia="true",
             boundmass="1e-6",
-            boundinertia=f"{PartSettings.least_inertia_kgm2:g}",
+            boundinertia=f"{PartSettings.min_inertia_kgm2:g}",
         )
         gravity = texts(np.array([0.0, 0.0, -GRAVITY_M_S2]))
         self._add(self._root, "option", timestep=f"{_Settings.step_s:g}", integrator="implicitfast", gravity=gravity)
@@ -185,7 +185,7 @@ class _Document:
     def _payloads(self, body: Any) -> None:
         for count, payload in enumerate(self._errors.payloads):
             held = self._add(body, "body", name=f"{self._robot.robot.marker_link}_payload_{count}")
-            centre, inertia = texts(payload.centre), texts(np.full(3, PartSettings.least_inertia_kgm2))
+            centre, inertia = texts(payload.centre), texts(np.full(3, PartSettings.min_inertia_kgm2))
             self._add(held, "inertial", pos=centre, mass=repr(payload.mass_kg), diaginertia=inertia)
 
     def _moves(self, joint: UrdfJoint) -> bool:
@@ -330,7 +330,7 @@ class _Document:
         reach = texts(np.array([-0.5 * width, 0.5 * width]))
         self._joint(body, name, **kind, range=reach, **stiff)
         torque = self._largest_torques[self._robot.joints.index(joint.name)]
-        friction = max(_Settings.friction_margin * float(torque), _Settings.least_friction)
+        friction = max(_Settings.friction_margin * float(torque), _Settings.min_friction)
         held = {f"{key}friction": value for key, value in _STIFF.items()}
         output = self._add(self._tendon, "fixed", name=name, frictionloss=f"{friction:.4g}", **held)
         for part in (joint.name, name):

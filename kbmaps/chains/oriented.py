@@ -13,9 +13,9 @@ from kbmaps.arrays import FloatArray, batches, evenly_spread, frozen, rows
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
-from kbmaps.contest import shared_by
 from kbmaps.errors import DegenerateDataError, NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import complete, number, pack, restoring, unpack
+from kbmaps.prequential import shared_by
 from kbmaps.robust import MEDIAN_NORM
 from kbmaps.rotations import exponentials, nearest_rotation, rotation_matrices, rotation_vectors
 

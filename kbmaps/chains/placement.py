@@ -18,10 +18,10 @@ class _Settings:
     steps: int = 30
     # Weights start nearly as in least squares; their scale halves with each step down to this many sigma.
     first_reach: float = 32.0
-    least_reach: float = 4.0
+    min_reach: float = 4.0
     first_damping: float = 1e-3
-    least_damping: float = 1e-9
-    most_damping: float = 1e6
+    min_damping: float = 1e-9
+    max_damping: float = 1e6
     # Once the weights have settled, a step that lowers the cost by less than this share is the last.
     small_gain: float = 1e-3
     settling: int = 4
@@ -107,7 +107,7 @@ class _Fitter:
         state = self._start(every, np.zeros((count, 3)) if tools is None else tools)
         damping, active = np.full(count, _Settings.first_damping), every
         for k in range(_Settings.steps):
-            reach = max(_Settings.first_reach * 0.5**k, _Settings.least_reach)
+            reach = max(_Settings.first_reach * 0.5**k, _Settings.min_reach)
             distances = state.distances[active]
             sigma = np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM
             sigma = np.maximum(sigma, RobustSettings.rounding_m)
@@ -118,10 +118,10 @@ class _Fitter:
             better = after <= before
             state.put(active[better], tried, better)
             damping[active] = np.where(
-                better, np.maximum(0.1 * damping[active], _Settings.least_damping), 10.0 * damping[active]
+                better, np.maximum(0.1 * damping[active], _Settings.min_damping), 10.0 * damping[active]
             )
             settled = better & (k >= _Settings.settling) & (before - after < _Settings.small_gain * before)
-            active = active[~(settled | (damping[active] > _Settings.most_damping))]
+            active = active[~(settled | (damping[active] > _Settings.max_damping))]
             if not len(active):
                 break
         return Placements(state.rotations, state.shifts, state.zeros, state.tools, state.distances)

@@ -30,7 +30,7 @@ class FilterSettings:
     # The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last
     # ones.
     noise_coordinates, noise_memory = 6.0, 900.0
-    least_noise_m = 1e-6  # no camera is better, and the formulas need a positive value
+    min_noise_m = 1e-6  # no camera is better, and the formulas need a positive value
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class RigidFilter:
         scales = np.zeros(self.parameters.size)
         scales[self._active] = self._scales
         of_steps = [FilterSettings.iterations, FilterSettings.small_bend, _GATE]
-        of_noise = [FilterSettings.noise_memory, FilterSettings.least_noise_m**2]
+        of_noise = [FilterSettings.noise_memory, FilterSettings.min_noise_m**2]
         constants = [*of_steps, *of_noise, RotationSettings.small_rad, self._reach]
         return filter_kernel(
             *self.parameters.tables, scales, self.parameters.turning.astype(np.float64), np.array(constants)
@@ -242,5 +242,5 @@ class RigidFilter:
         share = self.noise_square * float(np.trace(precision)) / 3.0
         total = self.noise_coordinates + 3.0 * share**2
         square = self.noise_square * (1.0 + share * (distance - 3.0) / total)
-        self.noise_square = max(square, FilterSettings.least_noise_m**2)
+        self.noise_square = max(square, FilterSettings.min_noise_m**2)
         self.noise_coordinates = min(total, FilterSettings.noise_memory)

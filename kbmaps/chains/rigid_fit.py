@@ -22,14 +22,14 @@ class _Settings:
     """
 
     # Lower bound of a residual's variance as a share of the noise: below, the pair explains itself.
-    least_share: float = 1e-4
+    min_share: float = 1e-4
     scales_per_sigma: float = 3.0
     # A given noise explains a sum of squared residuals unless its probability is below this (χ²).
     misfit_chance: float = 1e-3
     rounds: int = 80
     first_damping: float = 1e-3
-    least_damping: float = 1e-12
-    most_damping: float = 1e8
+    min_damping: float = 1e-12
+    max_damping: float = 1e8
     # A step that changes the fit by less than this share of the posterior's standard deviation is the last.
     small_step: float = 1e-4
 
@@ -94,7 +94,7 @@ class _Point:
         values, vectors = np.linalg.eigh(spread @ spread.swapaxes(1, 2))
         shares = 1.0 + np.where(inliers, -1.0, 1.0)[:, None] * values
         along = (vectors.swapaxes(1, 2) @ (self.residuals / sigma[:, None])[:, :, None])[:, :, 0]
-        return np.sqrt((np.square(along) / np.maximum(shares, _Settings.least_share)).sum(axis=1))
+        return np.sqrt((np.square(along) / np.maximum(shares, _Settings.min_share)).sum(axis=1))
 
     def cost(self, roots: FloatArray) -> float:
         residuals = np.einsum("ni,ni,n->", self.residuals, self.residuals, roots * roots)
@@ -129,14 +129,14 @@ class _Fitter:
         before, columns = point.cost(roots), np.einsum("ij,ij->j", design, design)
         squares = np.square(np.linalg.svd(design, compute_uv=False))
         self.used = float((squares / (1.0 + squares)).sum())  # γ of MacKay 1992, "Bayesian interpolation"
-        while self._damping <= _Settings.most_damping:
+        while self._damping <= _Settings.max_damping:
             damping_rows = np.sqrt(1.0 + self._damping * columns)
             q, r = np.linalg.qr(np.concatenate([design, np.diag(damping_rows)]))
             projected = q.T @ np.concatenate([target, -point.offset / damping_rows])
             length = float(np.linalg.norm(projected))
             trial = self._at(point.offset + np.linalg.solve(r, projected))
             if trial.cost(roots) <= before:
-                self.point, self._damping = trial, max(self._damping * 0.1, _Settings.least_damping)
+                self.point, self._damping = trial, max(self._damping * 0.1, _Settings.min_damping)
                 return length
             if length < _Settings.small_step:
                 return 0.0

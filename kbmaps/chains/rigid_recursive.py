@@ -37,7 +37,7 @@ class _Settings:
     but for `growth`, which then does not end, `first` by 4 %.
     """
 
-    least_window: int = 16
+    min_window: int = 16
     fresh: int = 200  # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain
     # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is
     # full.
@@ -58,8 +58,8 @@ class RigidWindow:
     STORED_BELIEF = ("before_mean", "before_root")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, size: int) -> None:
-        if size < _Settings.least_window:
-            raise SettingError(f"a window must hold at least {_Settings.least_window} pairs, got {size}")
+        if size < _Settings.min_window:
+            raise SettingError(f"a window must hold at least {_Settings.min_window} pairs, got {size}")
         self.size = size
         # posterior of the chain before the kept pairs
         self.belief = ChainBelief.from_tolerances(parameters, tolerances)
@@ -362,7 +362,7 @@ class RecursiveRigidLearner(Model):
         fit = self._window.fitted(self._filter.change)
         self._filter.go_on_from(fit.belief, fitted=True)
         if self._window.finds_noise:
-            self._filter.noise_square = max(fit.noise, FilterSettings.least_noise_m) ** 2
+            self._filter.noise_square = max(fit.noise, FilterSettings.min_noise_m) ** 2
             coordinates = fit.freedom + self._window.noise.coordinates
             fewest, most = FilterSettings.noise_coordinates, FilterSettings.noise_memory
             self._filter.noise_coordinates = float(np.clip(coordinates, fewest, most))

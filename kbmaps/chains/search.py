@@ -20,9 +20,9 @@ from kbmaps.rotations import cross_matrix
 class _Settings:
     steps: int = 150
     first_damping: float = 1e-2
-    least_damping: float = 1e-14
-    least_raised_damping: float = 1e-8
-    most_damping: float = 1e6
+    min_damping: float = 1e-14
+    min_raised_damping: float = 1e-8
+    max_damping: float = 1e6
     exact_m: float = 1e-12  # a start with a residual [m] this small has found the chain to the last digits
     # A start ends after this many steps that each reduce the squared residual by less than this share.
     stalled: float = 1e-4
@@ -118,12 +118,12 @@ class Descents:
                 arms.axes[taken], arms.points[taken] = tried.axes[better], tried.points[better]
                 last, squares[taken] = squares[taken], reached.squares[better]
                 stalled[taken] = np.where(squares[taken] > (1.0 - _Settings.stalled) * last, stalled[taken] + 1, 0)
-                damping[taken] = np.maximum(0.2 * damping[taken], _Settings.least_damping)
+                damping[taken] = np.maximum(0.2 * damping[taken], _Settings.min_damping)
                 steps[taken] += 1
                 gram[taken], slope[taken] = self._normal(arms[taken], reached[better])
-            damping[failed] = np.maximum(4.0 * damping[failed], _Settings.least_raised_damping)
+            damping[failed] = np.maximum(4.0 * damping[failed], _Settings.min_raised_damping)
             ended = (
-                (stalled >= _Settings.stalled_steps) | (steps >= _Settings.steps) | (damping > _Settings.most_damping)
+                (stalled >= _Settings.stalled_steps) | (steps >= _Settings.steps) | (damping > _Settings.max_damping)
             )
             ended |= squares <= pairs * _Settings.exact_m**2
             if (squares[ended] <= pairs * enough**2).any():

@@ -44,7 +44,7 @@ class BendSettings:
     # A pair far from the median of this many neighbours is clipped. Where more than half of them moved together, the
     # median moved as well.
     neighbours = 5
-    most_pairs: int = 1200  # maximum number of pairs, the newest ones, that are evaluated
+    max_pairs: int = 1200  # maximum number of pairs, the newest ones, that are evaluated
 
 
 # Log evidence of other pairs about bends of each length, without any such pairs.
@@ -244,7 +244,7 @@ def log_ratios_if_bending(
     and ℓ and the noise are weighted by their probability given all pairs without a change.
 
     Args:
-        angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], at most `BendSettings.most_pairs`.
+        angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], at most `BendSettings.max_pairs`.
         errors: errors of a model not fitted to any of the pairs, in units of their noise (n, 3).
         known: their derivatives by the known parameters, whose prior is of variance 1 (n, 3, k).
         turning: their derivatives by each joint, scaled so that 1 moves the marker by about the noise (n, 3, d).

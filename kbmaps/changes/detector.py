@@ -35,7 +35,7 @@ class DetectorSettings:
     evaluate_each_above: float = 4.0
     # Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
     pairs_between_false_alarms: float = 75_000.0
-    most_surprises: int = 3000  # number of the newest errors that are kept
+    max_surprises: int = 3000  # number of the newest errors that are kept
 
 
 class Onsets:
@@ -176,8 +176,8 @@ class ChangeDetector:
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
         self._differences: deque[float] = deque(maxlen=DetectorSettings.recent)
-        self._whitened_errors: deque[FloatArray] = deque(maxlen=DetectorSettings.most_surprises)
-        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=BendSettings.most_pairs)
+        self._whitened_errors: deque[FloatArray] = deque(maxlen=DetectorSettings.max_surprises)
+        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=BendSettings.max_pairs)
         self._last_is_outlier, self._evaluated_at, self._log_odds = False, 0, -math.inf
         self._fitted: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._bends_before: list[FloatArray] | None = None
@@ -199,7 +199,7 @@ class ChangeDetector:
 
     @property
     def whitened_errors(self) -> FloatArray:
-        """Whitened errors (n, 3) of the newest pairs, n at most `DetectorSettings.most_surprises`.
+        """Whitened errors (n, 3) of the newest pairs, n at most `DetectorSettings.max_surprises`.
 
         Each is against the prediction from the pairs before it. They are in units of the noise, without the model's own
         uncertainty.

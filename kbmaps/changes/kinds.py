@@ -22,7 +22,7 @@ class KindSettings:
     other_share = 0.001
     # Maximum number of pairs, evenly spread. They are not weighted up for the others: their noise would look like a
     # change of everything.
-    most_pairs = 400
+    max_pairs = 400
     steps = 6
 
 
@@ -132,7 +132,7 @@ def explanations(
         noise_m: 1-sigma of a coordinate [m].
         shared: number of neighbours that carry as much information as one independent pair.
     """
-    chosen = evenly_spread(len(q), KindSettings.most_pairs)
+    chosen = evenly_spread(len(q), KindSettings.max_pairs)
     q, x, counted = q[chosen], x[chosen], 1.0 / shared
     sizes = noise_m * np.array(KindSettings.sizes)
     fits = [_fit(before, kind, q, x, noise_m, counted, float(sizes[-1])) for kind in kinds]

@@ -57,7 +57,7 @@ class WhiteNoise:
             derivatives: derivatives of the positions by the joints (n, 3, d) [m/rad, or 1 for a prismatic joint].
         """
         joints = derivatives.shape[2]
-        if len(errors) - 1 < _Settings.fewest_a_variance * (joints + 2):
+        if len(errors) - 1 < _Settings.min_a_variance * (joints + 2):
             return cls.as_claimed(joints)
         off = np.diff(errors, axis=0) * np.sqrt(0.5)
         alike = np.broadcast_to(np.eye(3), (len(errors), 1, 3, 3))
@@ -94,8 +94,8 @@ class _Settings:
     longest_run: int = 1000  # longer runs are treated as this long
     # Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
     least: float = 1e-12
-    most_taken: float = 0.8  # a fit absorbs at most this share of the error that neighbours share
-    fewest_a_variance: int = 10  # minimum number of pairs for each estimated variance
+    max_taken: float = 0.8  # a fit absorbs at most this share of the error that neighbours share
+    min_a_variance: int = 10  # minimum number of pairs for each estimated variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class SharedNoise:
         together = np.maximum(variances / square, 1.0)
         if len(kept):
             # A shared error has fewer independent parts, of which a fit absorbs more: new pairs show more of it.
-            taken = min(used * float(together[-1]) / (3.0 * n), _Settings.most_taken)
+            taken = min(used * float(together[-1]) / (3.0 * n), _Settings.max_taken)
             alone = max(square - max(float(kept[0]), 0.0), 0.0)
             variances = alone + (variances - alone) / (1.0 - taken)
         variances = np.maximum.accumulate(variances * _raised(3.0 * n / together))

@@ -13,17 +13,17 @@ from kbmaps.arrays import BoolArray, FloatArray
 class _Settings:
     # The damping is this share of the error's square, times a factor adapted to the gain of the last steps.
     first_share: float = 0.1
-    least_share: float = 1e-4
-    most_share: float = 1e6
+    min_share: float = 1e-4
+    max_share: float = 1e6
     damping_floor_m2: float = 1e-18
     # No joint moves by more than this share of its half range in one step: the derivative does not hold farther.
     longest_step: float = 0.5
     # An error is stuck when its direction is this nearly perpendicular to the motion of every free joint.
     stuck_cosine: float = 1e-5
-    least_gain: float = 1e-4
+    min_gain: float = 1e-4
     # The descent to a posture has settled when its squared distance falls by less than this share a step.
     settled: float = 1e-6
-    least_portion: float = 1e-3
+    min_portion: float = 1e-3
     corrections: int = 4
     rounding_slope: float = 1e-10
     rounds_a_joint: int = 6
@@ -87,13 +87,13 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
             new_error = goal.error(new_q)
             left = error - jacobian @ step
             expected, gained = square - float(left @ left), square - float(new_error @ new_error)
-            if gained > _Settings.least_gain * expected and gained > 0.0:
+            if gained > _Settings.min_gain * expected and gained > 0.0:
                 break
             share *= 8.0
-            if share > _Settings.most_share:
+            if share > _Settings.max_share:
                 return Descent(q, error, step_number + 1, True)
         if gained > 0.75 * expected:
-            share = max(share / 8.0, _Settings.least_share)
+            share = max(share / 8.0, _Settings.min_share)
         elif gained < 0.25 * expected:
             share *= 2.0
         q, error = new_q, new_error
@@ -117,7 +117,7 @@ def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange
     q, steps, portion = reached.q, reached.steps, 1.0
     error = reached.error
     far = _square(q - posture, joints)
-    while steps < max_steps and portion > _Settings.least_portion:
+    while steps < max_steps and portion > _Settings.min_portion:
         jacobian = goal.jacobian(q)
         damping = 1e-10 * float(np.square(jacobian * joints.scale).sum()) + _Settings.damping_floor_m2
         towards = portion * (posture - q)
@@ -132,7 +132,7 @@ def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange
         q, error, far = tried.q, tried.error, new_far
         if settled:
             return Descent(q, error, steps, True)
-    return Descent(q, error, steps, portion <= _Settings.least_portion)
+    return Descent(q, error, steps, portion <= _Settings.min_portion)
 
 
 def _square(step: FloatArray, joints: JointRange) -> float:

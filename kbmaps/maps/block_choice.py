@@ -19,14 +19,14 @@ from kbmaps.maps.stack import BasisStack
 
 
 class BlockSettings:
-    most_blocks: int = 20
+    max_blocks: int = 20
     first_precision: float = 1e-3  # precision used while there are too few pairs for blocks
     # Neighbours on a path are nearly the same configuration: they share this much of their prior variance. In bases
     # over the whole turn that is a step of 8 degrees, along which a function that bends three times as fast still
     # shares 0.95.
     path_correlation: float = 0.995
     smallest_eigenvalue: float = 1e-15  # Relative to the largest eigenvalue of the kernel: smaller ones are rounding
-    fewest_blocks: int = 4
+    min_blocks: int = 4
     block_pairs: int = 30  # along a guided path, pairs this far apart share little of their errors
     # Candidate precisions, relative to the kernel's mean diagonal: from almost no prior to hardly any learning.
     precisions = 10.0 ** np.arange(-13.0, 3.25, 0.5)
@@ -53,11 +53,11 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
         q, x: pairs in the order of recording, (n, d) [rad, m] and (n, 3) [m].
 
     Returns:
-        λ as in `ExactLearner.solve`; with too few pairs for `BlockSettings.fewest_blocks`, one that trusts the prior.
+        λ as in `ExactLearner.solve`; with too few pairs for `BlockSettings.min_blocks`, one that trusts the prior.
     """
     angles, positions = matching_rows(q, x, len(prior.bases))
-    count = min(len(angles) // BlockSettings.block_pairs, BlockSettings.most_blocks)
-    if count < BlockSettings.fewest_blocks:
+    count = min(len(angles) // BlockSettings.block_pairs, BlockSettings.max_blocks)
+    if count < BlockSettings.min_blocks:
         return (
             BlockSettings.first_precision * float(np.diag(_kernel(prior, angles)).mean())
             if len(angles)

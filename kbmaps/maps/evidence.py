@@ -23,7 +23,7 @@ class _Settings:
     points: int = 41
     # Range of the search for the best variance around the mean square: below it down to float64's resolution, and
     # above.
-    least_share: float = 1e-20
+    min_share: float = 1e-20
     greatest_share: float = 1e2
     step: float = math.log(8.0)  # multiplicative step of the search
     # A vertex nearer than this share of a step is not tried: evidence is flat there, and a try costs a factorisation.
@@ -63,7 +63,7 @@ class LinearEvidence:
         mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
             return max(mean, RobustSettings.variance_floor)
-        tried = mean, _Settings.least_share * mean, _Settings.greatest_share * mean
+        tried = mean, _Settings.min_share * mean, _Settings.greatest_share * mean
         middle, low, high = (max(variance, RobustSettings.variance_floor) for variance in tried)
         for _ in range(_Settings.rounds):
             grid = np.geomspace(low, high, _Settings.points)

@@ -29,7 +29,7 @@ class ExactSettings:
     # The same for a Gram matrix, of which the refinement through the pairs needs only the first digits.
     smallest_gram_rcond: float = 1e-15
     # Refinement must gain this factor per step; otherwise the Gram matrix is too near to singular.
-    least_gain: float = 10.0
+    min_gain: float = 10.0
     # Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
     vanishing_ridge: float = 1e-13
     refinements: int = 30
@@ -68,7 +68,7 @@ def _refined(design: Design, gram: ShiftedGram, errors: FloatArray) -> FloatArra
     for done in range(ExactSettings.refinements):
         correction = step(errors - design.times(change))
         size = float(np.linalg.norm(correction))
-        if not size * ExactSettings.least_gain < left:
+        if not size * ExactSettings.min_gain < left:
             return change if done else None
         change, left = change + correction, size
     return change

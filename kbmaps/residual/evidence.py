@@ -23,7 +23,7 @@ class GroupSettings:
     """
 
     window: float = 4.0  # models less probable than the best by more than this many nats are left out of averages
-    least_gain: float = 0.5  # A group that gains less is left out of averages: it makes almost no difference
+    min_gain: float = 0.5  # A group that gains less is left out of averages: it makes almost no difference
     # Sets of groups less probable than the chosen one by more than this many nats are not extended.
     swap_window: float = 8.0
     rounds: int = 40
@@ -206,7 +206,7 @@ class GroupedModel:
         for active, posterior, odds in bases:
             for name in candidates if odds > -GroupSettings.swap_window else ():
                 gain, variance = (0.0, 0.0) if name in self.variances else self._gain(name, active, posterior)
-                if gain > GroupSettings.least_gain and odds + gain - GroupSettings.price_nats > -GroupSettings.window:
+                if gain > GroupSettings.min_gain and odds + gain - GroupSettings.price_nats > -GroupSettings.window:
                     more = {**active, name: variance}
                     models.append((more, self.posterior(active=more)))
                     log_odds.append(odds + gain - GroupSettings.price_nats)

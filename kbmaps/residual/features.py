@@ -25,13 +25,13 @@ SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
 
 
 class _Settings:
-    most_features: int = 500  # Larger groups are left out: arms of many joints then use the lower orders only
+    max_features: int = 500  # Larger groups are left out: arms of many joints then use the lower orders only
     # With more joints, loads are lumped into two points: the marker and the middle of all joints beyond.
     joints_with_own_loads: int = 8
-    least_range: float = 1e-3  # narrower joint ranges [rad, m] would scale the functions up too far
+    min_range: float = 1e-3  # narrower joint ranges [rad, m] would scale the functions up too far
     path_correlation: float = 0.9  # neighbours on a path share this much of smooth functions over the pairs' reach
     # A camera may be mounted on a head with up to this many joints; the link behind them then has constant gravity.
-    most_neck_joints: int = 3
+    max_neck_joints: int = 3
 
 
 Weights = Mapping[str, FloatArray]
@@ -75,10 +75,10 @@ class ResidualScaling:
     def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
         """Return the scaling of pairs (n, d) [rad, m] and (n, 3) [m], at least one."""
         low, high = q.min(axis=0), q.max(axis=0)
-        half = np.maximum(0.5 * (high - low), _Settings.least_range)
+        half = np.maximum(0.5 * (high - low), _Settings.min_range)
         centre = x.mean(axis=0)
         spread = math.sqrt(float(np.square(x - centre).mean()))
-        return cls(0.5 * (low + high), half, centre, max(spread, _Settings.least_range))
+        return cls(0.5 * (low + high), half, centre, max(spread, _Settings.min_range))
 
     @classmethod
     def whole_turns(cls, joints: int) -> ResidualScaling:
@@ -105,7 +105,7 @@ class ResidualFeatures:
         low, high = scaling.middle - scaling.half, scaling.middle + scaling.half
         self._stack = BasisStack(learning_bases(low, high, self._prismatic.tolist(), 1.0))
         self._products = {name: _products(self._prismatic, order + 1) for order, name in enumerate(SMOOTH_GROUPS)}
-        still = range(min(_Settings.most_neck_joints, self.joints - 2) + 1)
+        still = range(min(_Settings.max_neck_joints, self.joints - 2) + 1)
         self._still = {f"{COMPLIANCE} behind joint {k}" if k else COMPLIANCE: k for k in still}
         self._loads = {group: self._load_mask(k) for group, k in self._still.items()}
 
@@ -120,7 +120,7 @@ class ResidualFeatures:
     def groups(self) -> tuple[str, ...]:
         """Return the groups available for this arm."""
         names = (*READING_GROUPS, *self._still, *CAMERA_GROUPS, *SMOOTH_GROUPS)
-        return tuple(group for group in names if 0 < self.size(group) <= _Settings.most_features)
+        return tuple(group for group in names if 0 < self.size(group) <= _Settings.max_features)
 
     def approximate(self, groups: Iterable[str]) -> tuple[str, ...]:
         """Return the groups whose law is an engineering approximation instead of geometry."""

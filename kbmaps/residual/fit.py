@@ -32,7 +32,7 @@ class _Settings:
     selections: int = 2
     rows_at_once: int = 150  # few enough rows for a processor's cache
     # With fewer coordinates of pairs on a path, no group is added: it cannot be separated from shared errors.
-    fewest_on_path: int = 30
+    min_on_path: int = 30
     blocks: int = 8  # number of runs of pairs left out in turn on a path
     # A step that moves the predictions by less than this share of their posterior uncertainty is the last.
     small_step: float = 0.05
@@ -160,7 +160,7 @@ class _Fitter:
     def _candidate_groups(self) -> tuple[str, ...]:
         """Return groups with no more features than coordinates; the largest only if the previous one is active."""
         coordinates = 3 * int(self.inliers.sum())
-        if self._on_path and coordinates < _Settings.fewest_on_path:
+        if self._on_path and coordinates < _Settings.min_on_path:
             return tuple(self.variances)
         largest, before = SMOOTH_GROUPS[2], SMOOTH_GROUPS[1]
 
@@ -188,7 +188,7 @@ class _Fitter:
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
             parts = min(
-                max(len(rows) // BlockSettings.block_pairs, BlockSettings.fewest_blocks), _Settings.blocks, len(rows)
+                max(len(rows) // BlockSettings.block_pairs, BlockSettings.min_blocks), _Settings.blocks, len(rows)
             )
         else:
             parts = max(len(rows) // _Settings.rows_at_once, 1)

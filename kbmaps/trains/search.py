@@ -33,7 +33,7 @@ class SearchSettings:
     weight_scale: float = 4.0
     same_lengths: float = 0.05  # reweighting ends when no residual moves by more than this many standard deviations
     search_pairs: int = 40  # random starts use at most this many pairs per joint
-    least_freedom: float = 0.2  # with fewer degrees of freedom per pair, residuals cannot separate noise from outliers
+    min_freedom: float = 0.2  # with fewer degrees of freedom per pair, residuals cannot separate noise from outliers
     plausible: float = 0.1  # failed starts leave a tenth or more of the spread, and may agree on it by chance
 
 
@@ -220,10 +220,10 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
-    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, SearchSettings.least_freedom)))
+    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, SearchSettings.min_freedom)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
     least = pairs.noise_floor / fit.noise if pairs.unknown.any() else 1.0
-    return lengths / max(unit, least), freedom >= SearchSettings.least_freedom and not rounding
+    return lengths / max(unit, least), freedom >= SearchSettings.min_freedom and not rounding
 
 
 def _inlier_mask(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:

@@ -28,7 +28,7 @@ class MonitorSettings:
         0.1  # a model counts as the chain alone if it is this near to it, over the noise of a pair
     )
     min_noise_m: float = 1e-6  # lower bound of a measurement's noise, whatever it claims [m]
-    most_watched: int = 5000  # if no newer model comes, the older half of this many pairs is dropped
+    max_watched: int = 5000  # if no newer model comes, the older half of this many pairs is dropped
     looked_back: int = 1000  # number of the model's own pairs that show its noise
     # An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or
     # the alarm's log odds by this much.
@@ -128,7 +128,7 @@ class _HeldOutErrors:
     def with_newer(self, other: _HeldOutErrors) -> _HeldOutErrors:
         return _HeldOutErrors(
             *(
-                np.concatenate([getattr(self, name), getattr(other, name)])[-DetectorSettings.most_surprises :]
+                np.concatenate([getattr(self, name), getattr(other, name)])[-DetectorSettings.max_surprises :]
                 for name in ("q", "claimed", "off")
             )
         )
@@ -162,7 +162,7 @@ class ChangeMonitor:
 
     @property
     def monitored_count(self) -> int:
-        """Number of kept pairs, at most `MonitorSettings.most_watched` except for those since an alarm."""
+        """Number of kept pairs, at most `MonitorSettings.max_watched` except for those since an alarm."""
         return len(self._pairs)
 
     @property
@@ -191,7 +191,7 @@ class ChangeMonitor:
         """Add one or several pairs, learnt or, if not `kept` (n,), outliers."""
         if self._reference is None:
             self._advance_reference()  # not in `offer`: that runs in the background, and this takes a while
-        if len(self._pairs) + len(pairs) > MonitorSettings.most_watched and not self.alarmed:
+        if len(self._pairs) + len(pairs) > MonitorSettings.max_watched and not self.alarmed:
             dropped = len(self._pairs) // 2
             self._drop(dropped)
             self._requested_at, self._candidate_at = (

@@ -32,7 +32,7 @@ class BatchSettings:
     # Growth of the number of pairs before the next solution, with a new search for the maps' precision; the chain with
     # residual waits for it too, since it takes up to a second.
     growth = 1.15
-    fewest_for_map = 30  # Minimum number of orientations for a map: with fewer, the chain suffices
+    min_for_map = 30  # Minimum number of orientations for a map: with fewer, the chain suffices
 
 
 # An entry of a rotation matrix errs by this much of a small turn's 1-sigma about one axis: √(2/3).
@@ -83,7 +83,7 @@ class OrientationSolver:
         self._solved_at = self._pairs
         chosen = evenly_spread(len(self._q), BatchSettings.fitted)
         chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
-        if not self._with_map or self._pairs < BatchSettings.fewest_for_map:
+        if not self._with_map or self._pairs < BatchSettings.min_for_map:
             return OrientationSolution(self._pairs, chain)
         prior = chain.chain.to_kbmap(self._bases, orientation=True)
         if self._exact is None:

@@ -19,7 +19,7 @@ class ToleranceSettings:
     # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
     candidates = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
     compared_pairs = 100  # pairs at which candidates are compared with the posterior, evenly spread
-    least_share = 0.01  # less probable tolerances are not considered
+    min_share = 0.01  # less probable tolerances are not considered
     # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
     likely = 1.0 / 3.0
 
@@ -88,7 +88,7 @@ def probable_indices(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray
     """
     shares = np.exp(evidence - evidence.max())
     shares /= shares.sum()
-    kept = np.array([k for k in np.argsort(-shares) if shares[k] > ToleranceSettings.least_share], dtype=np.intp)
+    kept = np.array([k for k in np.argsort(-shares) if shares[k] > ToleranceSettings.min_share], dtype=np.intp)
     return kept, shares[kept] / shares[kept].sum()
 
 

@@ -20,9 +20,9 @@ from bodyschema.sim_backend.geometry import turn_of_z
 from bodyschema.sim_backend.physics_urdf import UrdfSettings
 from kbmaps.rotations import quaternions
 
-from .eye import TO_LIGHT, StereoRenderer
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
+from .stereo_renderer import TO_LIGHT, StereoRenderer
 
 
 class ToolStick:

@@ -652,8 +652,8 @@ def test_the_live_learner_names_a_wrong_reading(case) -> None:
         pair = Pair("s", k + 1, 1, float(k), "", recording.q[k], recording.x[k], 1e-8 * np.eye(3))
         learning.learn(pair, float(k))
         findings.renew()
-    assert (case or "") in "".join(findings.doubts)
-    assert bool(findings.doubts) == (case is not None)
+    assert (case or "") in "".join(findings.data_problems)
+    assert bool(findings.data_problems) == (case is not None)
 
 
 def test_live_learner_waits_for_enough_undoubted_pairs() -> None:
@@ -668,9 +668,9 @@ def test_live_learner_waits_for_enough_undoubted_pairs() -> None:
     )
     findings = Findings(learning, robot(), SystemClock())
     findings.renew()
-    assert findings.doubts == ()
+    assert findings.data_problems == ()
     findings.renew()
-    assert "q3 counts the other way" in findings.doubts[0]
+    assert "q3 counts the other way" in findings.data_problems[0]
 
 
 def test_sign_fitting_better_by_chance_only_warns(tmp_path: Path) -> None:

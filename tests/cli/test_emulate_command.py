@@ -123,5 +123,5 @@ def test_missing_servos_error_names_the_table_to_add(folder) -> None:
 
 
 def test_every_fault_is_listed(capsys) -> None:
-    app(["emulator", "--list-faults"], exit_on_error=False, result_action="return_value")
+    app(["emulate", "--list-faults"], exit_on_error=False, result_action="return_value")
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(FAULTS)

@@ -175,7 +175,7 @@ def test_blocks_of_a_recording_are_one_recording(tmp_path: Path, monkeypatch: py
 
 
 def test_more_numbers_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_csv.ColumnLimits, "most_numbers", 50)
+    monkeypatch.setattr(recording_csv.ColumnLimits, "max_numbers", 50)
     monkeypatch.setattr(recording_csv._Settings, "block_bytes", 50)
     (tmp_path / "a.csv").write_bytes(HEADER + b"0,0,1,2,3\n" * 11)
     with pytest.raises(RecordingError, match="there are more than 10 rows of these columns"):

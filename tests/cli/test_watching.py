@@ -118,7 +118,7 @@ def test_pictures_are_served_to_this_machine(host: str) -> None:
 def test_too_many_viewers_of_pictures_are_refused() -> None:
     with MjpegServer(0) as server:
         server.show(b"picture")
-        streams = [asked(server, "/stream", ["localhost"]) for _ in range(_Settings.most_viewers)]
+        streams = [asked(server, "/stream", ["localhost"]) for _ in range(_Settings.max_viewers)]
         assert {answer.status for answer in streams} == {200}
         assert asked(server, "/stream", ["localhost"]).status == 503
         assert asked(server, "/", ["localhost"]).status == 200

@@ -37,9 +37,9 @@ def test_unknown_reason_of_newer_version_is_shown() -> None:
 
 @pytest.mark.parametrize("reason", [Reason.NO_MARKER, Reason.EPIPOLAR, Reason.STALE, Reason.MOVING])
 def test_frames_all_refused_name_reason_and_remedy(tally, reason) -> None:
-    refuse(tally, reason, _Settings.fewest_frames)
+    refuse(tally, reason, _Settings.min_frames)
     assert tally.complaints == [
-        f"{_Settings.fewest_frames} of the last {_Settings.fewest_frames} frames were rejected: {WORDS[reason]}. "
+        f"{_Settings.min_frames} of the last {_Settings.min_frames} frames were rejected: {WORDS[reason]}. "
         f"{REMEDIES[reason]}"
     ]
 
@@ -54,7 +54,7 @@ def test_the_most_frequent_of_several_reasons_is_named(tally) -> None:
 
 
 def test_few_frames_are_no_reason_to_complain(tally) -> None:
-    refuse(tally, Reason.NO_MARKER, _Settings.fewest_frames - 1)
+    refuse(tally, Reason.NO_MARKER, _Settings.min_frames - 1)
     assert tally.complaints == []
 
 

@@ -141,7 +141,7 @@ def test_queue_overflow_is_recovered_from_history() -> None:
     fed = Fed(stored=1)
     fed.settle()
     fed.history.pairs = PAIRS[:10]
-    fed.publish(*[PAIRS[1]] * (FeedSettings.most_waiting + 50))
+    fed.publish(*[PAIRS[1]] * (FeedSettings.max_waiting + 50))
     fed.settle()
     assert fed.learnt == (10, 10)
 

@@ -166,7 +166,7 @@ def test_files_that_are_no_meshes_are_not_read(tmp_path, name: str, monkeypatch)
 
 
 def test_heavy_meshes_become_light(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(shapes._Settings, "most_triangles", 500)
+    monkeypatch.setattr(shapes._Settings, "max_triangles", 500)
     robot(tmp_path, mesh("a.stl"), mesh("a.stl", "1 1 -1"))
     (tmp_path / "a.stl").write_bytes(stl_bytes(ball(20)))
     found = read_shapes(tmp_path / "arm.urdf")
@@ -176,7 +176,7 @@ def test_heavy_meshes_become_light(tmp_path, monkeypatch) -> None:
 
 def test_even_triangles_that_share_nothing_stay_light() -> None:
     loose = np.random.default_rng(0).uniform(size=(100, 3, 3))
-    assert len(mesh_buffer(loose)) / 100 * _Settings.most_triangles < 2_000_000
+    assert len(mesh_buffer(loose)) / 100 * _Settings.max_triangles < 2_000_000
 
 
 def test_a_reader_that_dies_leaves_the_other_shapes(tmp_path, monkeypatch) -> None:

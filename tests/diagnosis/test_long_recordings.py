@@ -21,7 +21,7 @@ OFFSET_RAD, JUMP_RAD, JUMPED_AT = 0.02, 0.03, 163.5
 def in_a_part() -> Iterator[None]:
     """Call a recording of more than 240 rows long."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diagnosis.DiagnosisSettings, "most_rows", PART)
+        patch.setattr(diagnosis.DiagnosisSettings, "max_rows", PART)
         patch.setattr(diagnosis.DiagnosisSettings, "run", 20)
         yield
 

@@ -103,7 +103,7 @@ def test_data_that_are_none_are_refused(columns, told, tmp_path) -> None:
 
 
 def test_more_rows_than_are_read_are_refused_unread(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.recordings.columns.ColumnLimits.most_numbers", 100)
+    monkeypatch.setattr("bodyschema.recordings.columns.ColumnLimits.max_numbers", 100)
     source = dataset(tmp_path / "set", "v3.0", "degrees")
     with pytest.raises(RecordingError, match="there are more than 12 rows with the files before it"):
         read_lerobot_dataset(source, LeRobotUnits(CALIBRATION, SERVOS, "degrees"), marker())

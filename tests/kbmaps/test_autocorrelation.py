@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kbmaps.contest import shared_by
+from kbmaps.prequential import shared_by
 
 
 def series(rng: np.random.Generator, n: int, rho: float) -> np.ndarray:

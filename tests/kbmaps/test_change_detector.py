@@ -246,7 +246,7 @@ def test_an_alarm_of_a_rigid_arm_stands(kind: str) -> None:
 
 
 def test_the_number_of_kept_errors_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kbmaps.changes.detector.DetectorSettings.most_surprises", 100)
+    monkeypatch.setattr("kbmaps.changes.detector.DetectorSettings.max_surprises", 100)
     arm = Arm(0)
     detector = arm.detector()
     arm.feed(detector, slice(None))

@@ -16,11 +16,11 @@ COARSE_RAD = np.radians(1.0)
 
 def test_monitor_keeps_bounded_pairs_without_a_model() -> None:
     watch, cov = ChangeMonitor(), frozen_array(np.eye(3))
-    for seq in range(1, MonitorSettings.most_watched + 200):
+    for seq in range(1, MonitorSettings.max_watched + 200):
         watch.add(
             Pair("simulated", seq, 1, 0.0, "", frozen_array(np.zeros(2)), frozen_array(np.zeros(3)), cov), kept=True
         )
-    assert 0 < watch.monitored_count <= MonitorSettings.most_watched
+    assert 0 < watch.monitored_count <= MonitorSettings.max_watched
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_change_is_detected_within_one_batch(moved_m: float) -> None:
     noticed = [taught(pairs, seconds).change for seconds in (0.0, BATCH_WAIT_PER_ROBOT_S)]
     at_once, together = (0 if change is None else change.noticed_seq for change in noticed)
     assert before < at_once
-    assert before < together <= at_once + OnlineSettings.most_together
+    assert before < together <= at_once + OnlineSettings.max_together
 
 
 def test_pairs_after_a_change_join_the_new_regime() -> None:

@@ -13,7 +13,7 @@ from bodyschema.learning.online_learner import OnlineSettings
 from bodyschema.learning.snapshot import IN_SUPPORT
 from bodyschema.learning.solvers.orientation import BatchSettings
 from bodyschema.learning.solvers.solver import SolverSettings
-from kbmaps.contest import ContestSettings
+from kbmaps.prequential import ContestSettings
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
 

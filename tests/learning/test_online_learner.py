@@ -30,7 +30,7 @@ from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.snapshot import NoFrameError
 from bodyschema.learning.solvers.solver import DirectSolver, Solved
 from kbmaps import NLMS
-from kbmaps.contest import ContestSettings
+from kbmaps.prequential import ContestSettings
 
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 8))]
 HALF = 150

@@ -22,21 +22,21 @@ DRAWN = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
 
 
 def new_claims(belief: ChainBelief = DRAWN) -> UncertaintyTracker:
-    claims = UncertaintyTracker(NOMINAL.bases, 0.1)
-    claims.set_prior(belief)
-    return claims
+    uncertainty = UncertaintyTracker(NOMINAL.bases, 0.1)
+    uncertainty.set_prior(belief)
+    return uncertainty
 
 
-def learnt(claims: UncertaintyTracker, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
+def learnt(uncertainty: UncertaintyTracker, q: FloatArray, prior_error_m: float, error_m: float = 0.0) -> None:
     """Learn pairs at q, where the prior errs by the first, the instant learner by the second error on each axis."""
     for row in q:
         x = MODEL.predict(row[None]) + prior_error_m
-        claims.predicted(QueryPoints(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])
-        claims.learnt(row[None])
+        uncertainty.predicted(QueryPoints(row[None]), x, {PRIOR: x - prior_error_m, INSTANT: x - error_m}, NOISE[None])
+        uncertainty.learnt(row[None])
 
 
-def sigma(claims: UncertaintyTracker, name: str, q: FloatArray) -> float:
-    return float(np.sqrt(claims.of(name, MODEL.predict).variance(q)).mean())
+def sigma(uncertainty: UncertaintyTracker, name: str, q: FloatArray) -> float:
+    return float(np.sqrt(uncertainty.of(name, MODEL.predict).variance(q)).mean())
 
 
 def sure_belief(shift_m: float = 0.0) -> ChainBelief:
@@ -53,9 +53,9 @@ def walk() -> FloatArray:
 
 @pytest.mark.parametrize("name", [PRIOR, INSTANT])
 def test_sigma_far_from_data_is_the_tolerance_spread(name: str, walk: FloatArray) -> None:
-    claims = new_claims()
-    learnt(claims, walk, prior_error_m=0.001)
-    claimed = claims.of(name, MODEL.predict).variance(FAR)
+    uncertainty = new_claims()
+    learnt(uncertainty, walk, prior_error_m=0.001)
+    claimed = uncertainty.of(name, MODEL.predict).variance(FAR)
     np.testing.assert_allclose(claimed, DRAWN.predict_with_variance(FAR)[1], rtol=0.05)
 
 
@@ -66,18 +66,18 @@ def test_untrained_learner_claims_the_tolerance_spread() -> None:
 
 
 def test_instant_learner_sigma_is_small_near_data_only(walk: FloatArray) -> None:
-    claims = new_claims(sure_belief(0.04))
-    learnt(claims, walk, prior_error_m=0.04)
-    assert sigma(claims, INSTANT, walk) < 0.25 * 0.04
-    assert sigma(claims, INSTANT, FAR) == pytest.approx(0.04, rel=0.1)
+    uncertainty = new_claims(sure_belief(0.04))
+    learnt(uncertainty, walk, prior_error_m=0.04)
+    assert sigma(uncertainty, INSTANT, walk) < 0.25 * 0.04
+    assert sigma(uncertainty, INSTANT, FAR) == pytest.approx(0.04, rel=0.1)
 
 
 def test_prior_sigma_equals_distance_to_the_fitted_chain(walk: FloatArray) -> None:
-    claims = new_claims()
-    claims.fitted(sure_belief(0.04))
-    learnt(claims, walk, prior_error_m=0.04)
-    assert sigma(claims, PRIOR, walk) == pytest.approx(0.04, rel=0.05)
-    assert sigma(claims, PRIOR, FAR) == pytest.approx(0.04, rel=0.05)
+    uncertainty = new_claims()
+    uncertainty.fitted(sure_belief(0.04))
+    learnt(uncertainty, walk, prior_error_m=0.04)
+    assert sigma(uncertainty, PRIOR, walk) == pytest.approx(0.04, rel=0.05)
+    assert sigma(uncertainty, PRIOR, FAR) == pytest.approx(0.04, rel=0.05)
 
 
 def test_errors_larger_than_claimed_raise_the_claim(walk: FloatArray) -> None:
@@ -88,10 +88,10 @@ def test_errors_larger_than_claimed_raise_the_claim(walk: FloatArray) -> None:
 
 
 def test_residuals_at_learnt_pairs_raise_sigma_there(walk: FloatArray) -> None:
-    claims = new_claims(sure_belief())
-    learnt(claims, walk, prior_error_m=0.02)
-    claims.replayed(np.full((50, 3), 0.005))
-    assert sigma(claims, INSTANT, walk) == pytest.approx(0.005, rel=0.2)
+    uncertainty = new_claims(sure_belief())
+    learnt(uncertainty, walk, prior_error_m=0.02)
+    uncertainty.replayed(np.full((50, 3), 0.005))
+    assert sigma(uncertainty, INSTANT, walk) == pytest.approx(0.005, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -118,51 +118,51 @@ def test_sigma_outside_first_pairs_covers_nominal_model_error(known: tuple[bool,
 
 
 def test_solution_sigma_grows_by_its_misfit_outside_data(walk: FloatArray) -> None:
-    claims = new_claims()
-    learnt(claims, walk, prior_error_m=0.04)
-    claims.record_request()
-    claims.record_solution(RIGID, np.full((50, 3), 0.005), sure_belief(), neighbours=True)
-    assert sigma(claims, RIGID, walk) == pytest.approx(0.005, rel=0.1)
-    assert sigma(claims, RIGID, FAR) == pytest.approx(np.sqrt(2.0) * 0.005, rel=0.2)
+    uncertainty = new_claims()
+    learnt(uncertainty, walk, prior_error_m=0.04)
+    uncertainty.record_request()
+    uncertainty.record_solution(RIGID, np.full((50, 3), 0.005), sure_belief(), neighbours=True)
+    assert sigma(uncertainty, RIGID, walk) == pytest.approx(0.005, rel=0.1)
+    assert sigma(uncertainty, RIGID, FAR) == pytest.approx(np.sqrt(2.0) * 0.005, rel=0.2)
 
 
 def test_residuals_within_noise_do_not_raise_sigma(walk: FloatArray) -> None:
-    claims = new_claims()
-    learnt(claims, walk, prior_error_m=0.04)
-    claims.record_request()
+    uncertainty = new_claims()
+    learnt(uncertainty, walk, prior_error_m=0.04)
+    uncertainty.record_request()
     noise = np.random.default_rng(0).normal(0.0, np.sqrt(NOISE[0]), (50, 3))
-    claims.record_solution(RIGID, noise, sure_belief(), neighbours=True)
-    assert sigma(claims, RIGID, walk) < 1e-6
+    uncertainty.record_solution(RIGID, noise, sure_belief(), neighbours=True)
+    assert sigma(uncertainty, RIGID, walk) < 1e-6
 
 
 @pytest.mark.parametrize("answered", [RIGID, RESIDUAL])
 def test_previously_answering_model_wins_tie_after_tool_change(answered: str, walk: FloatArray) -> None:
-    claims = new_claims()
-    claims.change_tool(0.1, answered)
-    claims.set_prior(DRAWN)
+    uncertainty = new_claims()
+    uncertainty.change_tool(0.1, answered)
+    uncertainty.set_prior(DRAWN)
     far, alike = 0.04, 0.002
     for name in (RIGID, RESIDUAL):
-        claims.record_solution(name, np.zeros((10, 3)), None, neighbours=True)
+        uncertainty.record_solution(name, np.zeros((10, 3)), None, neighbours=True)
     for row in walk[:10]:
         x = MODEL.predict(row[None]) + alike
         missed = {PRIOR: far, INSTANT: far, RIGID: alike, RESIDUAL: alike}
-        claims.predicted(QueryPoints(row[None]), x, {name: x - miss for name, miss in missed.items()}, NOISE[None])
-    assert claims.best(PRIOR) == answered
+        uncertainty.predicted(QueryPoints(row[None]), x, {name: x - miss for name, miss in missed.items()}, NOISE[None])
+    assert uncertainty.best(PRIOR) == answered
 
 
 def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
-    claims, again = new_claims(), new_claims()
-    learnt(claims, walk, prior_error_m=0.04)
-    claims.change_tool(0.1)
-    claims.set_prior(DRAWN)
-    learnt(claims, walk[:30], prior_error_m=0.01, error_m=0.02)
-    state = msgspec.msgpack.decode(msgspec.msgpack.encode(claims.state()), type=UncertaintyState)
-    again.restore(state, claims.arrays())
+    uncertainty, again = new_claims(), new_claims()
+    learnt(uncertainty, walk, prior_error_m=0.04)
+    uncertainty.change_tool(0.1)
+    uncertainty.set_prior(DRAWN)
+    learnt(uncertainty, walk[:30], prior_error_m=0.01, error_m=0.02)
+    state = msgspec.msgpack.decode(msgspec.msgpack.encode(uncertainty.state()), type=UncertaintyState)
+    again.restore(state, uncertainty.arrays())
     anywhere = np.vstack([walk, FAR])
     for name in (PRIOR, INSTANT):
         np.testing.assert_allclose(
             again.of(name, MODEL.predict).variance(anywhere),
-            claims.of(name, MODEL.predict).variance(anywhere),
+            uncertainty.of(name, MODEL.predict).variance(anywhere),
             rtol=1e-9,
         )
 

@@ -13,8 +13,8 @@ from figures import Figures
 
 # By scene and class: the settings, and how far half or twice of each may move a figure of the scene.
 LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
-    (figures.learner, "kbmaps.chains.rigid_fit._Settings"): {"scales_per_sigma": 0.01, "least_share": 0.01},
-    (figures.learner, "kbmaps.contest.ContestSettings"): {"worse_ratio": 0.01, "recent_pairs": 0.01, "cap": 0.01},
+    (figures.learner, "kbmaps.chains.rigid_fit._Settings"): {"scales_per_sigma": 0.01, "min_share": 0.01},
+    (figures.learner, "kbmaps.prequential.ContestSettings"): {"worse_ratio": 0.01, "recent_pairs": 0.01, "cap": 0.01},
     (figures.learner, "kbmaps.maps.block_choice.BlockSettings"): {"first_precision": 0.01},
     (figures.learner, "bodyschema.learning.changes.monitor.MonitorSettings"): {"min_known": 0.01},
     (figures.learner, "bodyschema.learning.regime.RegimeSettings"): {
@@ -29,7 +29,7 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "retune": 0.01,
     },
     (figures.models, "kbmaps.chains.rigid_fit._Settings"): {"misfit_chance": 0.01},
-    (figures.models, "kbmaps.residual.evidence.GroupSettings"): {"window": 0.01, "least_gain": 0.05, "settled": 0.01},
+    (figures.models, "kbmaps.residual.evidence.GroupSettings"): {"window": 0.01, "min_gain": 0.05, "settled": 0.01},
     (figures.models, "kbmaps.residual.features._Settings"): {"path_correlation": 0.01},
     (figures.models, "kbmaps.residual.fit._Settings"): {"misfit_sigmas": 0.01},
     (figures.ball, "bodyschema.vision.ball.settings.OutlineSettings"): {
@@ -47,7 +47,7 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "usual_disagreement": 0.15,
         "disagreement_power": 0.05,
         "freedom": 0.1,
-        "least_density": 0.25,
+        "min_density": 0.25,
         "channels_noise": 0.15,
         "usual_density": 0.15,
         "measured": 0.25,

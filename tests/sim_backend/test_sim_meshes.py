@@ -158,7 +158,7 @@ def test_heavy_meshes_keep_their_shape(tmp_path) -> None:
     names = [known.add("ball.stl", (1.0, 1.0, scale), drawn=True) for scale in (1.0, 1.0, -2.0)]
     files, said = known.files()
     shapes = [triangles_of(files[name]) for name in names]
-    assert UrdfSettings.most_triangles / 4 < sum(map(len, shapes)) <= UrdfSettings.most_triangles
+    assert UrdfSettings.max_triangles / 4 < sum(map(len, shapes)) <= UrdfSettings.max_triangles
     assert said.startswith("the meshes have 86,400 triangles")
     radii = np.linalg.norm(shapes[0], axis=2)
     assert np.abs(radii - 0.1).max() < 0.004
@@ -351,9 +351,9 @@ def frame(name):
         ("", "300 0 0", "joint 'turn' is 300 m from the joint before it. Give metres"),
         (frame("x" * 1001), "0.3 0 0", "longer than 1000 bytes"),
         (
-            "".join(frame(f"l{k}") for k in range(UrdfSettings.most_links)),
+            "".join(frame(f"l{k}") for k in range(UrdfSettings.max_links)),
             "0.3 0 0",
-            f"up to {UrdfSettings.most_links} links, this one has",
+            f"up to {UrdfSettings.max_links} links, this one has",
         ),
     ],
 )

@@ -10,8 +10,8 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.sim_backend import CameraConfig
 from bodyschema.sim_backend.bullet import load_pybullet
 from bodyschema.sim_backend.config import SimTag
-from bodyschema.sim_backend.rendering.eye import TO_LIGHT, StereoRenderer, cluttered_room
 from bodyschema.sim_backend.rendering.raster import Grid, Raster
+from bodyschema.sim_backend.rendering.stereo_renderer import TO_LIGHT, StereoRenderer, cluttered_room
 
 PLAIN = CameraConfig(noise=0, clutter=0)
 UNTURNED = np.eye(3)

@@ -7,8 +7,8 @@ from guided_run import learning, shipped
 from bodyschema.sim_backend import ErrorConfig, SimConfig, true_chain
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.physics_urdf import physics_urdf
-from bodyschema.sim_backend.sight import Gaze
 from bodyschema.sim_backend.truth import JointRoles, TrueRobot
+from bodyschema.sim_backend.visibility import Gaze
 
 NO_ERRORS = ErrorConfig(
     joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0

@@ -17,7 +17,7 @@ from bodyschema.daemon.transport.identity import Identity, Route
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.session import client
 from bodyschema.dashboard.hub import Hub
-from bodyschema.dashboard.watch import Watch
+from bodyschema.dashboard.watch import ProcessFollower
 from bodyschema.interfaces.errors import BodyschemaError, BusError
 
 LIMIT_S = 400.0
@@ -41,7 +41,7 @@ def shown() -> dict[str, object]:
     """Return the page's data on both processes, once both are there or the time limit has passed."""
     hub = Hub()
     until = time.monotonic() + LIMIT_S
-    with Watch(Config.load(Path("robot.toml"), {}), hub):
+    with ProcessFollower(Config.load(Path("robot.toml"), {}), hub):
         while True:
             documents = json.loads(hub.all())
             known = {process: documents.get(process) or {} for process in ("sampler", "learner")}

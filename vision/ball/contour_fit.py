@@ -80,7 +80,7 @@ def fit_contour(
     if (is_angular or spectrum.quick > _Settings.largest_density * excess) and not aliased:
         return None
     influence_power = residual_spectrum(_influences(contour.weight, fit.weight, fit.residual), radius_px).mean
-    noise_density = _Settings.least_density + _Settings.channels_noise * contour.noise_share * excess
+    noise_density = _Settings.min_density + _Settings.channels_noise * contour.noise_share * excess
     density = math.hypot(
         noise_density, (_Settings.measured + influence_power / _Settings.usual_density) * influence_power
     )

@@ -83,7 +83,7 @@ class ContourSettings:
     # The wave once round is at least so large: this, and so many times the noise that the channels show; that the other
     # waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell
     # of far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
-    least_density, channels_noise, measured, usual_density = 0.5, 1.75, 0.4, 12.0
+    min_density, channels_noise, measured, usual_density = 0.5, 1.75, 0.4, 12.0
     # If a smaller share of the rays carries the circle, their errors are not averaged out: sigma grows in proportion.
     min_evenness = 0.5
     # What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole

@@ -22,7 +22,7 @@ _DICTIONARY = re.compile(r"(?:[4-7]X[4-7]_(?:50|100|250|1000)|ARUCO_ORIGINAL|APR
 
 
 class _Settings:
-    most_columns = 24  # of another board that is tried
+    max_columns = 24  # of another board that is tried
     # Allowed deviation of a marker's corners from a perspective image of a plane, due to lens distortion [sides].
     fitting_sides = 0.25
 
@@ -154,7 +154,7 @@ def visible_squares(numbers: Sequence[int], corners_px: Sequence[FloatArray], bo
         and _fit_error(numbers, seen, board.columns, board) < _Settings.fitting_sides
     ):
         return None
-    fits = {columns: _fit_error(numbers, seen, columns, board) for columns in range(3, _Settings.most_columns + 1)}
+    fits = {columns: _fit_error(numbers, seen, columns, board) for columns in range(3, _Settings.max_columns + 1)}
     columns = min(fits, key=lambda each: fits[each])
     if fits[columns] > _Settings.fitting_sides:
         return f"{board.columns}x{board.rows}"

@@ -26,7 +26,7 @@ OTHER_BOARD: tuple[FaultKind, ...] = ("mirrored", "other_dictionary", "other_pat
 
 class _Settings:
     min_corners = 6  # of a usable image
-    least_markers = 3  # that show which board is in view
+    min_markers = 3  # that show which board is in view
     smallest_grid = (4, 3)  # corners of an unknown chessboard: smaller ones are found in any texture
 
 
@@ -81,7 +81,7 @@ class BoardDetector:
             fault = image_fault(grey)
             return found if fault is None else NotFound(*fault)
         blur = blur_px(grey, self.board, found.numbers, found.px)
-        if blur > SharpnessSettings.most_blur_px:
+        if blur > SharpnessSettings.max_blur_px:
             text = f"blurred: edges have a 1-sigma of {blur:.1f} px. Hold the board still, focus, shorten the exposure"
             return NotFound("blurred", text)
         return Corners(found.numbers, found.px, blur)
@@ -89,7 +89,7 @@ class BoardDetector:
     def _find_charuco(self, grey: ImageArray) -> Corners | NotFound:
         px, numbers, marker_px, marker_numbers = self._charuco.detectBoard(grey)  # pyright: ignore
         markers = [] if marker_numbers is None else [int(number) for number in np.ravel(marker_numbers)]
-        if len(markers) >= _Settings.least_markers:
+        if len(markers) >= _Settings.min_markers:
             seen = visible_squares(
                 markers, [np.reshape(each, (4, 2)).astype(np.float64) for each in marker_px], self.board
             )
@@ -127,7 +127,7 @@ class BoardDetector:
     def _mirrored(self, grey: ImageArray, markers: int) -> NotFound | None:
         """Return the fault if a mirrored image has more markers; some markers look like others when mirrored."""
         mirrored = _markers(np.ascontiguousarray(grey[:, ::-1]), self.board.dictionary_name)
-        if len(mirrored) < max(_Settings.least_markers, markers + 1):
+        if len(mirrored) < max(_Settings.min_markers, markers + 1):
             return None
         return NotFound("mirrored", "the board is mirrored: print it again as it is, or mirror the images back")
 
@@ -167,7 +167,7 @@ class BoardDetector:
         for names in self._candidate_families(grey, families):
             seen = {name: _markers(grey, name) for name in names if name != expected}
             best = max(seen, key=lambda name: len(seen[name]), default="")
-            if best and len(seen[best]) >= _Settings.least_markers:
+            if best and len(seen[best]) >= _Settings.min_markers:
                 self._other_family = best
                 bits, _, size = best.partition("_")
                 return f"{bits}_{smallest_size(max(seen[best]) + 1)}" if size == str(SIZES[-1]) else best
@@ -179,9 +179,7 @@ class BoardDetector:
             yield [self._other_family]
         largest, smallest = f"_{SIZES[-1]}", f"_{SIZES[0]}"
         sized = [name for name in families if name.endswith(largest)]
-        yield [
-            name for name in sized if len(_markers(grey, name.replace(largest, smallest))) >= _Settings.least_markers
-        ]
+        yield [name for name in sized if len(_markers(grey, name.replace(largest, smallest))) >= _Settings.min_markers]
         yield list(families)
 
 

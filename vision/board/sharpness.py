@@ -18,7 +18,7 @@ from .board import Board
 class SharpnessSettings:
     along = 0.3  # of a square: where edges are sampled, away from corner and marker
     steepest = 0.999  # quantile of the slopes that counts as the steepest
-    most_blur_px = 2.5  # corner accuracy is a small share of the edge width; with more blur that share is too large
+    max_blur_px = 2.5  # corner accuracy is a small share of the edge width; with more blur that share is too large
 
 
 def blur_px(grey: ImageArray, board: Board, numbers: NDArray[np.int64], px: FloatArray) -> float:
@@ -90,6 +90,6 @@ def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blur
     if (white := too_white(grey)) is not None:
         return "over_exposed", f"over-exposed: {white:.0%} of the image is white. Shorten the exposure, less light"
     edge = sharpest_edge_px(np.asarray(grey, dtype=np.float64))
-    if edge > SharpnessSettings.most_blur_px:
+    if edge > SharpnessSettings.max_blur_px:
         return "blurred", f"blurred: the sharpest edge has a 1-sigma of {edge:.1f} px. Focus; hold the board still"
     return None

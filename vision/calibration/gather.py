@@ -18,7 +18,7 @@ from .view import EYES, ONE_EYE, Eye, View, image_of
 
 
 class _Settings:
-    most_names = 4  # of images in a message
+    max_names = 4  # of images in a message
     # Number of pairs after which another board is certain, and interval of progress messages.
     sure_pairs, told_pairs = 3, 10
 
@@ -109,9 +109,9 @@ def _kind(unusable: Unusable) -> str:
 
 def _named(group: Sequence[Unusable]) -> str:
     names = [each.name for each in group]
-    if len(names) <= _Settings.most_names:
+    if len(names) <= _Settings.max_names:
         return ", ".join(names)
-    return f"{', '.join(names[: _Settings.most_names - 1])} and {len(names) - _Settings.most_names + 1} more"
+    return f"{', '.join(names[: _Settings.max_names - 1])} and {len(names) - _Settings.max_names + 1} more"
 
 
 def _usual(texts: Sequence[str]) -> str:

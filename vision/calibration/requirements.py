@@ -19,9 +19,9 @@ def unmet_requirements(coverage: Coverage) -> list[str]:
     """Return the requirements that the views do not meet, before a fit."""
     reasons = []
     who = "both eyes saw" if len(coverage.eyes) > 1 else "the camera saw"
-    if coverage.whole_views < _Settings.least_views:
+    if coverage.whole_views < _Settings.min_views:
         reasons.append(
-            f"too few views: {who} the board in {coverage.whole_views}, at least {_Settings.least_views} are needed, "
+            f"too few views: {who} the board in {coverage.whole_views}, at least {_Settings.min_views} are needed, "
             f"{_Settings.wanted_views} are good"
         )
     tilted = np.count_nonzero(coverage.largest_tilts_deg > _Settings.tilted_deg)

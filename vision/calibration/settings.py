@@ -40,7 +40,7 @@ class ViewSettings:
     not measured.
     """
 
-    least_views, wanted_views = 8, 20  # seen by all eyes: fewer are refused, more are not asked for
+    min_views, wanted_views = 8, 20  # seen by all eyes: fewer are refused, more are not asked for
     min_cells, corners_a_cell = 6, 8  # of nine cells, in which so many corners were seen
     tilted_deg, min_tilted = 10.0, 3  # so many views with a tilt that tells focal length from distance
     # Sigmas are those of whole views, two to six times those of independent corners: fifteen good pairs at 640×480

@@ -15,7 +15,7 @@ from bodyschema.vision.image_checks import is_black, too_white
 class LookSettings:
     every_s = 0.5  # interval between two images that are looked at
     rate_over_s = 3.0  # time over which the frame rate is measured
-    fewest_frames = 5  # that make a rate
+    min_frames = 5  # that make a rate
     slow_share = 0.8  # of the configured rate
     step_px = 8  # between the pixels that are looked at
 
@@ -57,7 +57,7 @@ class ImageMonitor:
 
         Single lost frames do not change the median; a camera that loses every second frame counts as slow.
         """
-        if len(self._times) < LookSettings.fewest_frames:
+        if len(self._times) < LookSettings.min_frames:
             return None
         return 1.0 / float(np.median([later - earlier for earlier, later in pairwise(self._times)]))
 

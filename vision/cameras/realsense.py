@@ -25,7 +25,7 @@ from .stamps import Stamps
 
 class _Settings:
     queued_images = 16  # in the SDK's queue: five frames of three images
-    most_skew = 1e-3  # of rectified images: different focal lengths or turned eyes, relative or [rad]
+    max_skew = 1e-3  # of rectified images: different focal lengths or turned eyes, relative or [rad]
     window_px = 3  # around the marker's centre, in the depth image
 
 
@@ -233,7 +233,7 @@ class RealsenseCamera:
         distortion = max(abs(value) for eye in eyes for value in eye.coeffs)
         turn = float(np.abs(np.reshape(pose.rotation, (3, 3)) - np.eye(3)).max())
         baseline_m = -pose.translation[0]
-        if max(*unlike, distortion, turn) > _Settings.most_skew or baseline_m <= 0:
+        if max(*unlike, distortion, turn) > _Settings.max_skew or baseline_m <= 0:
             raise SourceError(
                 "the RealSense does not rectify these images: calibrate the eyes like two cameras (`bodyschema "
                 "calibrate cameras`), and name the file as calibration in [vision.cameras]"

@@ -26,11 +26,11 @@ from .shapes import rpy_of
 
 class _Settings:
     # A tag in a view whose corners are this many sigmas off (RMS) is none: covered, bent, or another of its number.
-    most_off_sigmas = 6.0
-    most_usual = 5.0  # ... in units of what is usual, which calibrated cameras bring to so much at most
+    max_off_sigmas = 6.0
+    max_usual = 5.0  # ... in units of what is usual, which calibrated cameras bring to so much at most
     # Largest share of all views, and of the views of one tag, with outliers; a single one is always allowed.
     max_left_out = 0.34
-    least_views = 3  # for a rigid cluster
+    min_views = 3  # for a rigid cluster
 
 
 Motion = tuple[FloatArray, FloatArray]  # rotation (3, 3) and place (3,) [m]
@@ -92,10 +92,10 @@ def measure_cluster(
             the tags do not fit one rigid body.
     """
     usable = _usable(views)
-    if len(usable) < _Settings.least_views:
+    if len(usable) < _Settings.min_views:
         raise CalibrationError(
             f"{len(usable)} of {len(views)} pairs of images show two tags or more to both eyes, at least "
-            f"{_Settings.least_views} are needed, 20 are good. Turn the cluster slowly, all its edges towards the "
+            f"{_Settings.min_views} are needed, 20 are good. Turn the cluster slowly, all its edges towards the "
             "cameras"
         )
     all_usable, left_out = usable, list[tuple[str, int]]()
@@ -107,7 +107,7 @@ def measure_cluster(
             return problem.result(left_out, [view.name for view in views if view.name not in used])
         left_out.append(worst)
         usable = _usable([_without(view, worst) for view in usable])
-        if len(usable) < _Settings.least_views or _has_too_many_outliers(left_out, all_usable):
+        if len(usable) < _Settings.min_views or _has_too_many_outliers(left_out, all_usable):
             bad_tag = _bad_tag(all_usable, calibration, side_m, other_sides_m)
             raise CalibrationError(_not_rigid_message(left_out, bad_tag))
 
@@ -126,14 +126,14 @@ def _bad_tag(
     fits: dict[int, float] = {}
     for id in sorted(set[int]().union(*(view.ids for view in views))):
         rest = _usable([_only(view, lambda other, id=id: other != id) for view in views])
-        if len(rest) < _Settings.least_views:
+        if len(rest) < _Settings.min_views:
             continue
         with suppress(CalibrationError):
             problem = _Problem(rest, calibration, side_m, other_sides_m or {})
             if problem.worst() is None:
                 fits[id] = problem.residual_rms
     best = min(fits, key=lambda id: fits[id], default=None)
-    return best if best is not None and fits[best] < _Settings.most_usual else None
+    return best if best is not None and fits[best] < _Settings.max_usual else None
 
 
 def _has_too_many_outliers(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -> bool:
@@ -346,7 +346,7 @@ class _Problem:
         rms = {key: float(np.sqrt(np.mean(np.concatenate(each)))) for key, each in squares.items()}
         key = max(rms, key=lambda each: rms[each])
         usual = float(np.median(list(rms.values())))
-        return key if rms[key] > _Settings.most_off_sigmas * min(max(usual, 1.0), _Settings.most_usual) else None
+        return key if rms[key] > _Settings.max_off_sigmas * min(max(usual, 1.0), _Settings.max_usual) else None
 
     def result(self, left_out: Sequence[tuple[str, int]], unused: Sequence[str]) -> MeasuredCluster:
         """Return the solution with its uncertainty, scaled up if the residuals exceed the assumed noise."""

@@ -42,7 +42,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     sides = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1) / length
     width, height = float(sides[::2].mean()), float(sides[1::2].mean())
     # From the middle of one black border to that of the other.
-    counts = [int(min(round((length - 1.0) * module), _Settings.most_samples)) for module in (width, height)]
+    counts = [int(min(round((length - 1.0) * module), _Settings.max_samples)) for module in (width, height)]
     x, y = (0.5 + (np.arange(count) + 0.5) * (length - 1.0) / count for count in counts)
     across, down = np.meshgrid(x, y)
     homogeneous = np.asarray(to_px, np.float64) @ np.stack([across.ravel(), down.ravel(), np.ones(across.size)])

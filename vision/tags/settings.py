@@ -74,7 +74,7 @@ class TagSettings:
 class BleedSettings:
     """Settings of the bleeding of white into black, which were not varied. It has converged as corners have."""
 
-    most_samples = 80  # along a row of modules; else one a pixel
+    max_samples = 80  # along a row of modules; else one a pixel
     rounds = 3  # of the fit: a fourth moves bleeding of a pixel by 0.002 px
     step_share = 0.01  # step of the derivative, in parts of the blur
     widest = 0.5  # bleeding by this share of a module leaves nothing of it

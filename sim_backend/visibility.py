@@ -25,7 +25,7 @@ class _Settings:
     nearest_m: float = 0.25
     farthest_m: float = 2.0
     # A tag is shown to the eyes by up to this angle from its normal, so that it can be measured.
-    most_oblique: float = np.radians(50.0)
+    max_oblique: float = np.radians(50.0)
     # Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
     ray_start_m: float = 0.06
     rim: float = 0.8
@@ -126,7 +126,7 @@ class Sight:
         away = T[:, :3, 3] - [0.5 * self._calibration.baseline_m, 0.0, 0.0]
         to_eyes = -away / np.linalg.norm(away, axis=1, keepdims=True)
         cosines = np.einsum("nij,kj,ni->nk", T[:, :3, :3], self._facing, to_eyes)
-        return cosines.max(axis=1) > np.cos(_Settings.most_oblique)
+        return cosines.max(axis=1) > np.cos(_Settings.max_oblique)
 
     def clear(self, q: FloatArray) -> bool:
         """Return True if, at one posture (d,), the ball is not hidden from the eyes and the arm touches nothing."""

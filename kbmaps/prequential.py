@@ -24,7 +24,7 @@ class ContestSettings:
     # pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
     recent_pairs: int = 50
     worse_ratio: float = 1.2
-    least_m: float = 1e-6  # a difference too small for any camera [m]
+    min_m: float = 1e-6  # a difference too small for any camera [m]
     # A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
     cap: float = 9.0
     least: float = 1e-30  # Lower bound of the median [m²]: where a model is exact, another one that errs still loses
@@ -198,7 +198,7 @@ def _recently_worse(errors: FloatArray, others: FloatArray) -> bool:
         return False
     return (
         float(np.sqrt(errors[both]).mean())
-        > ContestSettings.worse_ratio * float(np.sqrt(others[both]).mean()) + ContestSettings.least_m
+        > ContestSettings.worse_ratio * float(np.sqrt(others[both]).mean()) + ContestSettings.min_m
     )
 
 

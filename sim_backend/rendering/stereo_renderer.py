@@ -32,7 +32,7 @@ class _Settings:
     squares: int = 8
     # Free pixels around the marker in its finely sampled rectangle, and the most samples across it.
     margin_px: int = 4
-    most_samples: int = 480
+    max_samples: int = 480
     # The arm is rendered at half resolution, except around the marker: at 1 it takes four times as long.
     scene_step: int = 2
     supersampling: int = 3  # samples across one pixel around the marker
@@ -255,7 +255,7 @@ class StereoRenderer:
         if window is None:
             return
         left, top, width, height = window
-        fine = max(1, min(_Settings.supersampling, _Settings.most_samples // max(width, height)))
+        fine = max(1, min(_Settings.supersampling, _Settings.max_samples // max(width, height)))
         grid = Grid(left, top, width * fine, height * fine, fine)
         bgr, depth = self._raster.render(T_world_eye, grid)
         patch = image[top : top + height, left : left + width]
