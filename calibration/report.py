@@ -316,7 +316,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
     distance_mm = 1e3 * float(np.median(np.linalg.norm(calibration.residuals[off], axis=1)))
     where = "" if len(longest) == 1 else f" (the longest run: number {longest[0]} to {longest[-1]})"
     return [
-        f"{100.0 * len(off) / len(calibration.recording):.0f} % of the pairs do not fit and were left out: they are "
+        f"{100.0 * len(off) / len(calibration.recording):.0f} % of the samples do not fit and were left out: they are "
         f"off by {distance_mm:.3g} mm (median){where}. So many are seldom errors of the instrument: ask what was "
         "different there, such as a joint that carries another one along, or a marker or an instrument that was moved."
     ]

@@ -108,7 +108,8 @@ class Calibration:
         needed = min_pairs(len(robot.joints), trusted)
         if len(recording) < needed:
             raise CalibrationError(
-                f"{len(recording)} pairs are too few to calibrate {len(robot.joints)} joints; record at least {needed}"
+                f"{len(recording)} samples are too few to calibrate {len(robot.joints)} joints; "
+                f"record at least {needed}"
             )
         known = {"pose_known": robot.camera.pose_known, "marker_known": robot.robot.marker_known}
         try:

@@ -37,9 +37,9 @@ GROUPS = {
         "emulate": "Emulate the servos of robot.toml on a port.",
     },
     "Data and fleet": {
-        "record": "Save the running sampler's pairs to a file.",
-        "export": "Convert pairs or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
-        "backup": "Save pairs, checkpoint and robot.toml, or restore them.",
+        "record": "Save the running sampler's samples to a file.",
+        "export": "Convert samples or a robot: CSV, Parquet, MCAP, MJCF, URDF.",
+        "backup": "Save samples, checkpoint and robot.toml, or restore them.",
         "fleet": "List, compare and diagnose many robots.",
     },
 }
@@ -48,8 +48,8 @@ OPTIONS = {"--help (-h)": "Display this message and exit.", "--version": "Displa
 # Each paragraph is one line: the terminal's width wraps it.
 HELP = """Calibrate a robot arm by moving it by hand in front of a camera.
 
-Joint encoders and a stereo camera give samples. A learner turns them into the forward kinematics that the camera \
-sees, hand-eye and tool included.
+Joint encoders and one or two cameras give samples. A learner turns them into the forward kinematics that the cameras \
+see, hand-eye and tool included.
 
 New here? Type: bodyschema demo. Each command's --help says what it needs and what comes next."""
 

@@ -41,8 +41,8 @@ ENVIRONMENT = "BODYSCHEMA_"
 
 
 class _Settings:
-    # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25
-    # ms there, with 13 joints 57 ms, and from a camera pairs come every 33 ms.
+    # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a sample take
+    # 25 ms there, with 13 joints 57 ms, and from a camera samples come every 33 ms.
     largest_map: int = 3**12
     largest_ball_m: float = 0.5  # a larger radius is one of another unit [m]
 
@@ -52,19 +52,19 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     # where store and checkpoint live, relative to robot.toml; by default $XDG_STATE_HOME/bodyschema/<robot name>
     state_dir: str | None = None
-    # min_step_deg, max_step_deg: Euclidean norm over all joints of the step between neighbouring pairs. Nearer: wait.
+    # min_step_deg, max_step_deg: Euclidean norm over all joints of the step between neighbouring samples. Nearer: wait.
     # Farther: a new segment. Prismatic joints count with `metres_per_degree`.
     min_step_deg: Positive = 1.0
     max_step_deg: Positive = 3.0
     metres_per_degree: Positive = 0.005  # how far a prismatic joint moves for what counts as one degree
-    # accept every pair whatever its step (recordings of static poses far apart); each starts a segment of its own where
-    # the step is larger than `max_step_deg`
+    # accept every sample whatever its step (recordings of static poses far apart); each starts a segment of its own
+    # where the step is larger than `max_step_deg`
     any_step: bool = False
     max_reading_gap_s: Positive = 0.1  # encoder readings around a frame may be this far apart
     max_marker_speed_m_s: Positive = 3.0  # a marker that moved faster since its last fix is not believed
-    # pairs older than this are deleted, but never the newest 20,000; without it, age does not matter
+    # samples older than this are deleted, but never the newest 20,000; without it, age does not matter
     keep_days: Positive | None = None
-    # maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted, but never the newest 20,000.
+    # maximum size of the store in 10^6 bytes; the oldest samples beyond it are deleted, but never the newest 20,000.
     # Without it, the disk is the limit.
     keep_mb: Positive | None = None
 

@@ -110,7 +110,7 @@ class Diagnoses:
         while not self._stopping and len(pairs) < NEWEST_PAIRS and (page := history.page()):
             pairs += page
         if not pairs or self._stopping:
-            raise RequestError("the sampler has no pairs yet. Move the arm in front of the camera")
+            raise RequestError("the sampler has no samples yet. Move the arm in front of the camera")
         recordings.write(recordings.from_pairs(pairs, self._joints), out / RECORDING)
         return len(pairs)
 

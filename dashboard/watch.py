@@ -168,7 +168,9 @@ class ProcessFollower:
         """
         status = self._sampler.status
         if status is None or not self._sampler.answers:
-            raise BusError("the sampler does not answer, and it has the pairs. Start it with `bodyschema run sampler`")
+            raise BusError(
+                "the sampler does not answer, and it has the samples. Start it with `bodyschema run sampler`"
+            )
         return History(self._sessions["sampler"], self._config.robot, max(1, status.pairs - newest + 1))
 
     def _listen(self) -> None:

@@ -28,10 +28,10 @@ WORDS: Mapping[Reason, str] = {
     Reason.STALE: "encoder readings too far apart",
     Reason.MOVING: "joints too fast for the time stamps",
     Reason.LATE_JOINTS: "joints too fast for the times of their readings",
-    Reason.TOO_NEAR: "hardly any motion since the last pair",
+    Reason.TOO_NEAR: "hardly any motion since the last sample",
     Reason.PAUSED: "paused",
     Reason.NOT_FINITE: "a position that is no number",
-    Reason.NOT_STORED: "the disk took no pair",
+    Reason.NOT_STORED: "the disk took no sample",
     Reason.NOT_BORNE: "zero-force is off",
 }
 REMEDIES: Mapping[Reason, str] = {

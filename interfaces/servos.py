@@ -12,7 +12,7 @@ from .protocols import JointSource
 
 
 class Sample(Protocol):
-    """A servo's sample; see `drivers.dynamixel.channel.Sample`."""
+    """A servo's reading; see `bodyschema.drivers.servos.channel.Sample`."""
 
     @property
     def velocity(self) -> float: ...
@@ -21,7 +21,7 @@ class Sample(Protocol):
 
 
 class MountedServo(Protocol):
-    """An identified servo; see `bodyschema.drivers.servos.handshake.IdentifiedServo`."""
+    """An identified servo; see `bodyschema.drivers.servos.servo.IdentifiedServo`."""
 
     @property
     def id(self) -> int: ...

@@ -475,12 +475,13 @@ class OnlineLearner:
         needed, have = self.nominal.pairs_to_align, self._regimes.waiting.count
         if have >= needed:
             return (
-                f"there is no model yet: robot.toml says {self.nominal.unknown}, and the first fit of the {have} pairs "
-                "so far is not finished. Ask again in some seconds; if it stays so, guide the arm to other poses"
+                f"there is no model yet: robot.toml says {self.nominal.unknown}, and the first fit of the {have} "
+                "samples so far is not finished. Ask again in some seconds; if it stays so, guide the arm to other "
+                "poses"
             )
         return (
             f"there is no model yet: robot.toml says {self.nominal.unknown}, so positions have no frame until about "
-            f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema run sampler` and guide "
+            f"{needed} samples have come ({have} so far). Start the sampler with `bodyschema run sampler` and guide "
             "the arm"
         )
 
@@ -489,20 +490,20 @@ def _check_pair(pair: Pair, counters: Counters, joints: int) -> None:
     """Raise RequestError if a pair is of another robot or store, not new, or not a measurement."""
     if counters.store not in (None, pair.store):
         raise RequestError(
-            f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"
+            f"sample {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"
         )
     if pair.seq <= counters.last_seq:
-        raise RequestError(f"pair {pair.seq} has been learnt already; the last one was {counters.last_seq}")
+        raise RequestError(f"sample {pair.seq} has been learnt already; the last one was {counters.last_seq}")
     if len(pair.q) != joints:
-        raise RequestError(f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {joints}")
+        raise RequestError(f"sample {pair.seq} has {len(pair.q)} joint angles, this robot has {joints}")
     if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
-        raise RequestError(f"pair {pair.seq} has a number that is not finite")
+        raise RequestError(f"sample {pair.seq} has a number that is not finite")
     if np.abs(pair.x).max() > PairLimits.farthest_m:
-        raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
+        raise RequestError(f"sample {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
     if np.abs(pair.q).max() > PairLimits.largest_q:
-        raise RequestError(f"pair {pair.seq} has the joint angle {np.abs(pair.q).max():.3g}; angles are in radians")
+        raise RequestError(f"sample {pair.seq} has the joint angle {np.abs(pair.q).max():.3g}; angles are in radians")
     if np.abs(pair.cov).max() > PairLimits.farthest_m**2:
-        raise RequestError(f"pair {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
+        raise RequestError(f"sample {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
     spread = np.linalg.eigvalsh(pair.cov)
     if spread[0] < -OnlineSettings.rounding_share * max(spread[-1], 0.0):
-        raise RequestError(f"pair {pair.seq} has a cov that is no covariance: a variance of {spread[0]:.3g} m²")
+        raise RequestError(f"sample {pair.seq} has a cov that is no covariance: a variance of {spread[0]:.3g} m²")

@@ -10,15 +10,15 @@ from bodyschema.robot.hand_eye import HandEye
 class CurvePoint(msgspec.Struct, frozen=True, array_like=True):
     """One point of the learning curve: a list of two numbers."""
 
-    pairs: int  # pairs learnt
-    error_m: float  # error on new pairs then, before each was learnt [m]
+    pairs: int  # samples learnt
+    error_m: float  # error on new samples then, before each was learnt [m]
 
 
 class LearntFigure(msgspec.Struct, frozen=True):
     """One value of the robot's files, nominal and learnt."""
 
     drawn: float  # from robot.toml
-    learnt: float  # from the pairs
+    learnt: float  # from the samples
     half_width: float  # of its 95 % interval
 
 
@@ -30,9 +30,9 @@ class JointZero(msgspec.Struct, frozen=True):
 
 
 class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
-    """Camera, tool and joint offsets of the learnt rigid chain, updated seconds after new pairs."""
+    """Camera, tool and joint offsets of the learnt rigid chain, updated seconds after new samples."""
 
-    pairs: int  # pairs with the present tool behind it
+    pairs: int  # samples with the present tool behind it
     camera_link: str  # the camera's parent link
     camera_xyz: list[LearntFigure]  # position of the measurement frame in that link [m]
     camera_rpy: list[LearntFigure]  # its orientation, as in URDF [rad]
@@ -41,29 +41,29 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
     # joint offsets, by joint; null where not identifiable and kept at nominal, which the other figures assume
     zeros: dict[str, JointZero | None]
     # axes_rad, points_m: estimated deviation of axis directions [rad] and axis positions [m] from the URDF, 1-sigma;
-    # null where the pairs do not determine it
+    # null where the samples do not determine it
     axes_rad: float | None
     points_m: float | None
     noise_m: float  # 1-sigma of a measured coordinate [m]
-    outliers: int  # among the last 500 pairs: too far from the chain for this noise
+    outliers: int  # among the last 500 samples: too far from the chain for this noise
     hand_eye: HandEye | None = None  # the camera's pose for ROS; null from a learner of an earlier version
     marker_covariance: list[float] | None = None  # of the marker in its link, 3 × 3 row by row [m²]; null likewise
 
 
 class DataOutlook(msgspec.Struct, frozen=True, kw_only=True):
-    """Expected gain of further pairs."""
+    """Expected gain of further samples."""
 
-    pairs: int  # pairs with the present tool behind it
+    pairs: int  # samples with the present tool behind it
     error_m: float  # claimed error where data is [m]
-    least_error_m: float  # part of it that further pairs cannot reduce [m]
+    least_error_m: float  # part of it that further samples cannot reduce [m]
     anywhere_m: float  # expected error over the full ranges of all joints [m]
-    further_pairs: list[int]  # numbers of further pairs, ascending
+    further_pairs: list[int]  # numbers of further samples, ascending
     like_so_far_m: list[float]  # `error_m` after each, with motion as so far [m]
     # most informative motion: `moving as so far`, `moving all joints over their ranges` or `moving JOINT over its
     # range`
     best_motion: str
     best_motion_m: list[float]  # `error_m` after each, with that motion [m]
-    # no motion would gain a tenth of `error_m`, or of the measurement noise, with as many pairs as the last of
+    # no motion would gain a tenth of `error_m`, or of the measurement noise, with as many samples as the last of
     # `further_pairs`
     enough: bool
 
@@ -71,11 +71,11 @@ class DataOutlook(msgspec.Struct, frozen=True, kw_only=True):
 class OrientationStatus(msgspec.Struct, frozen=True):
     """Accuracy of the learnt marker orientation."""
 
-    pairs: int  # pairs with an orientation, with the present tool
+    pairs: int  # samples with an orientation, with the present tool
     answering: str  # answering model
     # recent mean angle between prediction and new measurement, before learning, by model [rad]
     prequential_rad: dict[str, float]
-    claimed_rad: float | None  # claimed mean angle to the truth where data is [rad]; null before a few pairs
+    claimed_rad: float | None  # claimed mean angle to the truth where data is [rad]; null before a few samples
 
 
 TOOL, CAMERA, JOINT = "tool", "camera", "joint"
@@ -83,7 +83,7 @@ TOOL, CAMERA, JOINT = "tool", "camera", "joint"
 
 class NamingSettings:
     named_probability = 0.95  # a kind at least this probable is named
-    named_within_pairs = 500  # a change is named or renamed within this many pairs; after them it stays as it is
+    named_within_pairs = 500  # a change is named or renamed within this many samples; after them it stays as it is
 
 
 class KindOfChange(msgspec.Struct, frozen=True):
@@ -97,14 +97,14 @@ class KindOfChange(msgspec.Struct, frozen=True):
 class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Last change."""
 
-    first_seq: int  # sequence number of the most probable first pair after it
+    first_seq: int  # sequence number of the most probable first sample after it
     # earliest_seq, latest_seq: 95 % interval of that number
     earliest_seq: int
     latest_seq: int
-    noticed_seq: int  # the pair at which it was detected; of a reported change, the last one before it
-    found: bool  # True if it was detected in the pairs, False if it was reported
+    noticed_seq: int  # the sample at which it was detected; of a reported change, the last one before it
+    found: bool  # True if it was detected in the samples, False if it was reported
     kinds: list[KindOfChange]  # possible kinds, the most probable first
-    moved_m: float | None = None  # motion of the marker at the pairs since, root mean square [m]; None if unknown
+    moved_m: float | None = None  # motion of the marker at the samples since, root mean square [m]; None if unknown
 
     @property
     def named(self) -> KindOfChange | None:

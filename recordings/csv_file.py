@@ -47,7 +47,7 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
                 most = ColumnLimits.max_numbers // len(names)
                 raise Fault(f"there are more than {most:,} rows of these columns", remedy="Cut the recording")
     if not rows:
-        raise Fault("there are no rows below the header", remedy="Record at least one pair")
+        raise Fault("there are no rows below the header", remedy="Record at least one sample")
     table = Table(names, np.concatenate(blocks))
     check_finite(table)
     if not whole:

@@ -41,7 +41,7 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None
     centres = [pair.centres_px for pair in pairs]
     turns = [pair.R for pair in pairs if pair.R is not None]
     if 0 < len(turns) < len(pairs):
-        log.warning("%d of %d pairs have no orientation, so it is left out", len(pairs) - len(turns), len(pairs))
+        log.warning("%d of %d samples have no orientation, so it is left out", len(pairs) - len(turns), len(pairs))
     return Recording(
         joints=joints,
         q=np.array([pair.q for pair in pairs]),
@@ -78,7 +78,7 @@ def stored_pairs(file: Path) -> StoredPairs:
         if damage.count:
             log.warning("%s", damage.sentence(file))
         if not pairs:
-            raise RecordingError("the store has no pairs", file=file, remedy="Move the arm in front of the camera")
+            raise RecordingError("the store has no samples", file=file, remedy="Move the arm in front of the camera")
         return StoredPairs(pairs[0].store, from_pairs(pairs, reader.joints, file), [pair.seq for pair in pairs])
 
 
@@ -107,7 +107,7 @@ def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recor
     """Return the recording; raise RecordingError if its joints are not these in this order."""
     if recording.joints != joints:
         raise RecordingError(
-            f"the pairs are of other joints: {', '.join(recording.joints)}",
+            f"the samples are of other joints: {', '.join(recording.joints)}",
             file=file,
             remedy=f"Give the robot.toml that they were taken with; this one has {', '.join(joints)}",
         )
@@ -121,7 +121,7 @@ def between(recording: Recording, first: int, last: int | None, file: Path) -> R
     if not chosen.any():
         upto = "" if last is None else f" to number {last}"
         raise RecordingError(
-            f"there are no pairs from number {first} on{upto}; the last one is {len(recording)}",
+            f"there are no samples from number {first} on{upto}; the last one is {len(recording)}",
             file=file,
             remedy="Move the arm in front of the camera, or give another --first",
         )
@@ -131,7 +131,9 @@ def between(recording: Recording, first: int, last: int | None, file: Path) -> R
 def check_target(out: Path, *, force: bool) -> None:
     """Raise RecordingError unless a recording can be written to `out`: known ending, no file in the way."""
     if out.suffix.lower() == URDF:
-        raise RecordingError("a URDF is of a robot, not of pairs", file=out, remedy="`bodyschema calibrate` learns one")
+        raise RecordingError(
+            "a URDF is of a robot, not of samples", file=out, remedy="`bodyschema calibrate` learns one"
+        )
     require_target(out, _WRITERS, "recordings", force=force, error=RecordingError)
 
 

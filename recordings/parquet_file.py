@@ -38,7 +38,7 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
                 raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
         content = _read(arrow, parquet)
     if content.num_rows == 0:
-        raise Fault("there are no rows", remedy="Record at least one pair")
+        raise Fault("there are no rows", remedy="Record at least one sample")
     values = np.column_stack([_column(name, content.column(name)) for name in names])
     table = Table(names, values)
     check_finite(table)

@@ -154,7 +154,7 @@ class _Check:
             label = nearest.label(self.robot.joints, fit.zeros)
             nearest_text = f". The nearest reading is that {label}, and it does not fit"
         return Plausibility(
-            f"the pairs are hardly of this robot: {self._nominal_arm_misses()}, and with joints exchanged, counting "
+            f"the samples are hardly of this robot: {self._nominal_arm_misses()}, and with joints exchanged, counting "
             f"the other way or a quarter turn off still by {mm(after)}",
             "Is the recording or the URDF of another robot, is the camera on the hand and the marker in the room, are "
             "the time stamps late (`bodyschema diagnose --force` measures it), or is more than one thing wrong with "
@@ -167,7 +167,7 @@ class _Check:
         names = self.robot.joints
         mirrored = self.robot.camera.pose_known and reading.mirrored
         frame = order_of_axes(fit.rotation, mirrored=True) if mirrored else ""
-        fits = f"the pairs then fit to {mm(after)}, and as they are to {mm(self._error_unchanged)}"
+        fits = f"the samples then fit to {mm(after)}, and as they are to {mm(self._error_unchanged)}"
         text = f"{reading.label(names, fit.zeros)}{frame}: {fits}"
         if after > self._error_unchanged:
             text = (
@@ -175,7 +175,7 @@ class _Check:
                 "the arm before you use the model"
             )
         alternatives = "; or ".join(other.label(names, self.search.fits[other].zeros) for other in self.others)
-        alternatives = f". These pairs fit as well if {alternatives}" if alternatives else ""
+        alternatives = f". These samples fit as well if {alternatives}" if alternatives else ""
         if self._error_unchanged > THRESHOLDS.much_better * fit.error:
             better = self._error_unchanged / max(fit.error, self.search.exact_m)
             remedy = reading.remedy(names, fit.zeros) + alternatives
@@ -217,7 +217,7 @@ class _Check:
         return Plausibility(warnings=tuple(warnings), undirected=self.search.undirected(names))
 
     def _nominal_arm_misses(self) -> str:
-        return f"placed as well as it can be, the nominal arm misses the pairs by {mm(self._error_unchanged)}"
+        return f"placed as well as it can be, the nominal arm misses the samples by {mm(self._error_unchanged)}"
 
 
 def _softened(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibility:
@@ -225,7 +225,7 @@ def _softened(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausib
     enough = pairs >= FEWEST_ROWS and (found.better == 1.0 or search.is_certain(math.log(found.better)))
     if found.refusal is None or enough or found.better >= THRESHOLDS.decisively:
         return found
-    many = f"{pairs} pairs of {len(search.poses.rows)} poses"
+    many = f"{pairs} samples of {len(search.poses.rows)} poses"
     few = f"{found.refusal}. {found.remedy}. (These are {many}: about {FEWEST_ROWS} poses decide.)"
     return Plausibility(warnings=(few,))
 
@@ -260,7 +260,7 @@ def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFi
         return None
     return Plausibility(
         f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
-        f"{order_of_axes(fit.rotation, mirrored=False)}: the pairs then fit to {mm(rms_free)}, and as they are to "
+        f"{order_of_axes(fit.rotation, mirrored=False)}: the samples then fit to {mm(rms_free)}, and as they are to "
         f"{mm(rms_known)}",
         "Correct the columns x, y, z, the pose of the camera or the zero of the first joint; or set pose_known = false",
         misread=True,

@@ -47,7 +47,7 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
             which = f"{', '.join(first)} and {last}" if first else last
             rows_are = "rows {} are outliers" if off > 1 else "row {} is an outlier"
             return (
-                f"perhaps {rows_are.format(which)}: without, the pairs fit to {mm(float(errors[best]))}, and as they "
+                f"perhaps {rows_are.format(which)}: without, the samples fit to {mm(float(errors[best]))}, and as they "
                 f"are to {mm(before)}. Measure there again, or leave the rows out"
             )
     return ""
@@ -72,7 +72,7 @@ def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArr
         return None
     row, remedy = _moved(shift)
     return Plausibility(
-        f"it seems that angles and positions are shifted against each other: with the angles of {row}, the pairs fit "
+        f"it seems that angles and positions are shifted against each other: with the angles of {row}, the samples fit "
         f"to {mm(after)}, and as they are to {mm(before)}",
         _or_late(remedy, shift, t),
         misread=True,

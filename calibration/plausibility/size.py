@@ -62,7 +62,7 @@ def wrong_size(size: Size, spread: float, before: float, best: float) -> Plausib
     factor, low, high = (size.factor * math.exp(k * size.log_sigma) for k in (0.0, -1.96, 1.96))
     text = (
         f"the positions are {factor:.3g} times as large as the arm makes them (95 %: {low:.4g} to {high:.4g}): "
-        f"divided by that, the pairs fit to {mm(size.error)}, and as they are to {mm(before)}"
+        f"divided by that, the samples fit to {mm(size.error)}, and as they are to {mm(before)}"
     )
     remedy = (
         "Compare with what was measured: the size of the printed tag or the ball in [vision], the squares of the "

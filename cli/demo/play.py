@@ -308,7 +308,7 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         learner = stack.enter_context(ZenohSession(connect=endpoints.learner, client=True))
         asker = stack.enter_context(started_query_load(scene, seed))
         stage = _Stage(config, daemon, sampler, learner, asker, show, seed)
-        before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first + second)
+        before = stage.learn(first, f"guided by hand, {first} samples with the first tool", first + second)
         changed_at = stage.change_tool()
         after = stage.learn(second, "guided by hand, the tool is 250 mm longer now", first + second)
         return Outcome(stage.rows, before, after, changed_at, asker.answers, asker.unanswered)
@@ -319,7 +319,7 @@ def stalled(sampler: SamplerStatus) -> str:
     why = ", ".join(f"{count} rejected: {reason}" for reason, count in rejected(sampler))
     seen = f"the sampler has seen {sampler.frames} frames" + (f", {why}" if why else "")
     more = "More may be in daemon.log. Try another --seed or marker"
-    return f"no new pair for {_Settings.stall_limit_s:.0f} s; {seen}. {more}"
+    return f"no new sample for {_Settings.stall_limit_s:.0f} s; {seen}. {more}"
 
 
 @dataclass

@@ -52,8 +52,8 @@ class _Lines:
         if verdict and verdict.angle_rad is not None:
             truth, what = f"{truth} {degrees(verdict.angle_rad)}", ""  # no room for both
         line = (
-            f"{learner.pairs:5d} of {snapshot.target} pairs; "
-            f"{what}next pair {mm(learner.prequential_m.get(learner.answering))}, "
+            f"{learner.pairs:5d} of {snapshot.target} samples; "
+            f"{what}next sample {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, held out {truth}"
         )
         if line != self._last_line:
@@ -69,7 +69,7 @@ def _screen(snapshot: Snapshot) -> RenderableType:
     head.add_column(justify="right", no_wrap=True)
     head.add_row(
         ProgressBar(total=snapshot.target, completed=min(learner.pairs, snapshot.target)),
-        f"{learner.pairs} of {snapshot.target} pairs, {sampler.pairs_per_s:.0f}/s",
+        f"{learner.pairs} of {snapshot.target} samples, {sampler.pairs_per_s:.0f}/s",
     )
     body = Table.grid(padding=(0, 4))
     body.add_row(_errors(snapshot), _frames(sampler))
@@ -93,14 +93,14 @@ def _errors(snapshot: Snapshot) -> Table:
         table.add_row("how the marker is turned, held out [°]", degrees(verdict.angle_rad, unit=""))
     for name, error in learner.prequential_m.items():
         mark = " (answers)" if name == learner.answering else ""
-        table.add_row(f"next pair, {name}{mark}", mm(error, unit=""))
+        table.add_row(f"next sample, {name}{mark}", mm(error, unit=""))
     return table
 
 
 def _frames(status: SamplerStatus) -> Table:
     table = titled_table("frames")
     table.add_row("seen", str(status.frames))
-    table.add_row("accepted as pairs", Text(str(status.pairs), style="bold green"))
+    table.add_row("accepted as samples", Text(str(status.pairs), style="bold green"))
     for reason, count in rejected(status):
         table.add_row(f"rejected: {reason}", str(count))
     return table

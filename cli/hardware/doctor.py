@@ -170,10 +170,10 @@ def disk_checks(folder: Path) -> Iterator[Check]:
         existing = next(path for path in (folder, *folder.parents) if path.exists())
     except PermissionError as error:
         remedy = "bodyschema run --state-dir FOLDER    # one that you can write"
-        yield Check("disk", "wrong", f"{folder}, where pairs are to be kept, is not yours: {error.strerror}", remedy)
+        yield Check("disk", "wrong", f"{folder}, where samples are to be kept, is not yours: {error.strerror}", remedy)
         return
     if not os.access(existing, os.W_OK):
-        message = f"{existing} cannot be written, and pairs are to be kept in {folder}"
+        message = f"{existing} cannot be written, and samples are to be kept in {folder}"
         yield Check("disk", "wrong", message, f"sudo chown $USER {existing}")
         return
     free = shutil.disk_usage(existing).free
@@ -200,7 +200,7 @@ def store_checks(file: Path) -> Iterator[Check]:
         message = f"{audit.lost_rows} notes on runs or servos in {file} cannot be read: the disk changed them"
         yield Check("store", "warning", message, "bodyschema backup before.zip")
     else:
-        yield Check("store", "ok", f"all {audit.pairs} pairs in {file} are as they were written")
+        yield Check("store", "ok", f"all {audit.pairs} samples in {file} are as they were written")
 
 
 def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> Iterator[Check]:

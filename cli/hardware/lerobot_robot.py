@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -115,7 +116,10 @@ def joint_servos(servos: Servos) -> list[JointServo]:
 
 
 def _make(model: KnownModel) -> Make:
-    return "feetech" if model.table == "feetech" else "dynamixel"
+    for make in get_args(Make):
+        if make == model.table:
+            return make
+    raise ConfigError(f"LeRobot has no arms with servos of {model.table}")
 
 
 def _ids(bus: ScannedBus) -> str:

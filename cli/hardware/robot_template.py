@@ -83,7 +83,7 @@ learner = "tcp/127.0.0.1:7448"
 [daemon]
 # Store and checkpoint; else $XDG_STATE_HOME/bodyschema/<name>.
 # state_dir = "state"
-# Neighbouring pairs are this far apart in joint space; farther starts a new segment.
+# Neighbouring samples are this far apart in joint space; farther starts a new segment.
 min_step_deg = 1.0
 max_step_deg = 3.0
 

@@ -126,7 +126,7 @@ def _state_dir(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> P
     if not (seen or backup.has(ROBOT_TOML, robot_file)):
         where = "in a hidden folder" if folder.is_relative_to(home) else "outside of its folder"
         raise BackupError(
-            f"the robot.toml in {backup.file} keeps pairs and checkpoint {where}. {NOTHING_CHANGED}. "
+            f"the robot.toml in {backup.file} keeps samples and checkpoint {where}. {NOTHING_CHANGED}. "
             f"Give --state-dir {str(folder)!r} to put them there, or another folder"
         )
     return folder

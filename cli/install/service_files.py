@@ -53,7 +53,7 @@ class ServiceFiles(UnitFiles):
         ConfigError: the name is invalid for a service.
     """
 
-    kind, stays = "service", "Pairs and checkpoints are where they were."
+    kind, stays = "service", "Samples and checkpoints are where they were."
 
     def __init__(
         self,

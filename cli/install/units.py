@@ -109,7 +109,7 @@ ExecReload=/bin/kill -HUP $MAINPID
 # Fed by the loops that work, so that one which hangs starves it; the abort leaves every thread's place in the journal.
 WatchdogSec={watchdog_s}
 {kept_running}
-# Five times what the learner takes after 60,000 pairs, ten times the sampler: what grows beyond it is started again.
+# Five times what the learner takes after 60,000 samples, ten times the sampler: what grows beyond it is started again.
 MemoryMax={memory_mib}M
 # The store and the checkpoint.
 StateDirectory=bodyschema/%i

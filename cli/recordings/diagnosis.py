@@ -104,7 +104,7 @@ def measured(
         RecordingError: they cannot be read, or are not in radians and metres.
     """
     if live == (file is not None):
-        raise RequestError("name a recording, or give --live for the running sampler's pairs: one of the two")
+        raise RequestError("name a recording, or give --live for the running sampler's samples: one of the two")
     joints = config.robot.joints
     if file is None:
         with client(config.route("sampler")) as bus:
@@ -120,7 +120,7 @@ def _history(history: History, joints: tuple[str, ...]) -> Recording:
     while page := history.page():
         pairs += page
     if not pairs:
-        raise DiagnosisError("the sampler has no pairs yet. Move the arm in front of the camera")
+        raise DiagnosisError("the sampler has no samples yet. Move the arm in front of the camera")
     return recordings.from_pairs(pairs, joints)
 
 
@@ -195,12 +195,12 @@ def run(
     min_pairs = 5 * len(robot.joints)
     if len(recording) < min_pairs:
         raise DiagnosisError(
-            f"{source.name}: {len(recording)} pairs are too few to tell causes of {len(robot.joints)} joints apart. "
+            f"{source.name}: {len(recording)} samples are too few to tell causes of {len(robot.joints)} joints apart. "
             f"Record at least {min_pairs}; some hundred are better"
         )
     if np.ptp(recording.q, axis=0).max() < HypothesisSettings.still:
         raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
-    tell(f"{len(recording)} pairs of {source.name}")
+    tell(f"{len(recording)} samples of {source.name}")
     chain = NominalModel.extended_by(config.simulation).chain
     plausible = plausibility(
         robot,
@@ -254,7 +254,7 @@ def require_writable(folder: Path) -> None:
 def written(found: ReportedDiagnosis, folder: Path) -> None:
     """Write the files of DIR; raise ConfigError, RecordingError if they cannot be written."""
     about = About(found.source.name, found.robot.name, version("bodyschema"))
-    heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
+    heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} samples of {about.recording}"
     extended = found.diagnosis.stored.written
     description = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(extended, folder, description, replace=True)

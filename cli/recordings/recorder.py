@@ -77,9 +77,9 @@ def copy_history(history: History, robot: RobotDescription, out: Path) -> int:
         pairs += page
     if not pairs:
         raise RecordingError(
-            f"the sampler has no pairs from number {history.next_seq} on",
+            f"the sampler has no samples from number {history.next_seq} on",
             file=out,
-            remedy="Move the arm in front of the camera, or wait for pairs with --follow",
+            remedy="Move the arm in front of the camera, or wait for samples with --follow",
         )
     _write(recordings.from_pairs(pairs, robot.joints), out, robot)
     return len(pairs)
@@ -142,7 +142,7 @@ class _CsvRows:
             self._stream.write(",".join(table.names) + "\n")
         if table.names != self._names:
             raise RecordingError(
-                f"from pair {pairs[0].seq} to {pairs[-1].seq} some have a marker orientation and some do not",
+                f"from sample {pairs[0].seq} to {pairs[-1].seq} some have a marker orientation and some do not",
                 file=Path(self._stream.name),
                 remedy=f"The {self.count} rows so far are whole; record what follows into another file",
             )

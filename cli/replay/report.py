@@ -85,7 +85,7 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
     lines = [
         f"{report.rows} rows of {report.recording}; {report.held_out} held out "
         f"({report.held_out_blocks} of {BLOCKS} contiguous blocks)",
-        f"the sampler accepted {report.accepted} pairs; rejected: {rejected}",
+        f"the sampler accepted {report.accepted} samples; rejected: {rejected}",
     ]
     if report.any_step:
         lines.append(f"--any-step: the step and speed rules were relaxed; {report.steps}")
@@ -98,13 +98,13 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         *([] if report.angle is None else [_angles(report.angle)]),
         f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
         f"{report.answering}). {_verdict(report)}",
-        f"error on new pairs before they were learnt: {by_model or 'none'}",
-        f"the errors above count the noise of the measurements; on new pairs where data is the learner expects "
+        f"error on new samples before they were learnt: {by_model or 'none'}",
+        f"the errors above count the noise of the measurements; on new samples where data is the learner expects "
         f"{mm(_metres(report.expected_mm))}; its 1-sigma and that noise together cover "
         f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
         f"{report.in_support_share:.0%} of the held-out rows lie where data was",
         *([] if report.outlook is None else [outlook_sentence(report.outlook)]),
-        f"{report.replayed} replay steps, {report.doubted} pairs rejected as outliers, {report.learning_s:.1f} s",
+        f"{report.replayed} replay steps, {report.doubted} samples rejected as outliers, {report.learning_s:.1f} s",
         *([] if report.doubt is None else ["", f"Warning: {report.doubt}"]),
     ]
     return "\n".join(_wrapped(line, width) for line in lines)

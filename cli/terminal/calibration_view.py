@@ -20,7 +20,7 @@ class _Settings:
 
 def view(report: CalibrationReport) -> Group:
     """Return tables of the figures, followed by sentences on their meaning."""
-    table = ruled_table(f"{report.robot}, {report.pairs} pairs of {report.source}", "nominal", "learnt", "95 %")
+    table = ruled_table(f"{report.robot}, {report.pairs} samples of {report.source}", "nominal", "learnt", "95 %")
     _section(table, f"camera on {report.camera_link}")
     _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.camera_xyz_mm, 2)
     _figures(table, ("roll [°]", "pitch [°]", "yaw [°]"), report.camera_rpy_deg, 3)
@@ -35,7 +35,7 @@ def view(report: CalibrationReport) -> Group:
 def sentences(report: CalibrationReport) -> list[str]:
     lines = [_expected(report)] if report.expected_mm is not None else []
     lines += [
-        f"Mean distance to the pairs: {_distances(report)}. {_noise(report)} {_outliers(report)}",
+        f"Mean distance to the samples: {_distances(report)}. {_noise(report)} {_outliers(report)}",
         _workmanship(report),
     ]
     if report.trusted == "nothing":
@@ -49,7 +49,7 @@ def sentences(report: CalibrationReport) -> list[str]:
         )
     if report.undirected:
         lines.append(
-            f"These pairs do not show which way {', '.join(report.undirected)} "
+            f"These samples do not show which way {', '.join(report.undirected)} "
             f"count{'s' if len(report.undirected) == 1 else ''}: the positions are the same either way."
         )
     if report.first > 1:
@@ -70,7 +70,7 @@ def two_tools(report: CalibrationReport) -> str:
     """Return advice for a recording made with two different tools."""
     return (
         f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on "
-        f"{report.marker_link}: these are pairs of two tools, and no figure is right for both. Calibrate them "
+        f"{report.marker_link}: these are samples of two tools, and no figure is right for both. Calibrate them "
         "separately: "
         f"--first {report.other_tool_from}, or --last {(report.other_tool_from or 0) - 1}."
     )
@@ -87,7 +87,7 @@ def _distances(report: CalibrationReport) -> str:
 
 def _noise(report: CalibrationReport) -> str:
     cause = "Noise" if report.trusted == "nothing" else "Noise and errors of the URDF"
-    scatter = f"{cause} in a coordinate, as the pairs scatter: {report.noise_mm:.3f} mm"
+    scatter = f"{cause} in a coordinate, as the samples scatter: {report.noise_mm:.3f} mm"
     if report.told_noise_mm is None:
         return f"{scatter}."
     return f"{scatter}; as stated with them: {report.told_noise_mm:.3f} mm, on which the intervals rest."
@@ -113,7 +113,7 @@ def _workmanship(report: CalibrationReport) -> str:
     if report.trusted != "nothing":
         return _trusted(report)
     if report.axes_deg is None or report.points_mm is None:
-        return "These pairs do not show how accurately the arm is made; the intervals hold for any accuracy."
+        return "These samples do not show how accurately the arm is made; the intervals hold for any accuracy."
     return (
         f"Estimated deviation from the URDF (1 sigma): axis directions {report.axes_deg:.2g}°, axis positions "
         f"{report.points_mm:.2g} mm."

@@ -19,7 +19,7 @@ def outlook_lines(outlook: DataOutlook | None) -> list[str]:
     if outlook is None:
         return ["not known yet"]
     pairs = outlook.further_pairs[-1]
-    like = f"{pairs} more pairs like these take {_gain(outlook, outlook.like_so_far_m)} off the error beyond noise"
+    like = f"{pairs} more samples like these take {_gain(outlook, outlook.like_so_far_m)} off the error beyond noise"
     return [
         f"{'yes' if outlook.enough else 'no'}: {like}",
         f"{pairs} of {outlook.best_motion}: {_gain(outlook, outlook.best_motion_m)}"
@@ -33,8 +33,9 @@ def outlook_sentence(outlook: DataOutlook) -> str:
     if _other_is_better(outlook):
         best = f"{outlook.best_motion} gains most: {_gain(outlook, outlook.best_motion_m)}"
     return (
-        f"{outlook.further_pairs[-1]} more pairs like these would take {_gain(outlook, outlook.like_so_far_m)} off the "
-        f"error beyond noise where the arm was; {best}. {'Enough data.' if outlook.enough else 'More data would help.'}"
+        f"{outlook.further_pairs[-1]} more samples like these would take {_gain(outlook, outlook.like_so_far_m)} off "
+        f"the error beyond noise where the arm was; {best}. "
+        f"{'Enough data.' if outlook.enough else 'More data would help.'}"
     )
 
 
@@ -63,7 +64,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
     facts.add_row("arm made to", _workmanship(calibration))
     facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
     return Group(
-        Text(f"calibration: from robot.toml to what {calibration.pairs} pairs show, ± for 95 %", style="bold"),
+        Text(f"calibration: from robot.toml to what {calibration.pairs} samples show, ± for 95 %", style="bold"),
         table,
         facts,
     )
@@ -71,7 +72,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
 
 def _workmanship(calibration: ChainCalibration) -> str:
     if calibration.axes_rad is None or calibration.points_m is None:
-        return "not determined by these pairs"
+        return "not determined by these samples"
     return f"about {math.degrees(calibration.axes_rad):.2g}° and {1e3 * calibration.points_m:.2g} mm"
 
 
@@ -85,7 +86,7 @@ def _gain(outlook: DataOutlook, after_m: list[float]) -> str:
 
 
 def _outliers(count: int) -> str:
-    return f"{count or 'no'} outlier{'' if count == 1 else 's'} among the last pairs"
+    return f"{count or 'no'} outlier{'' if count == 1 else 's'} among the last samples"
 
 
 def _moves(figures: list[LearntFigure], unit: float) -> list[str]:

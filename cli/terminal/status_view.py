@@ -140,7 +140,7 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     if status.behind:
         age = "" if status.age_s is None else f"; the newest learnt is {_duration(status.age_s)} old"
         facts.add_row("", f"{status.behind} stored and not learnt yet{age}")
-    facts.add_row("new pairs", f"missed by: {errors}")
+    facts.add_row("new samples", f"missed by: {errors}")
     if status.prequential_pairs:
         facts.add_row("", f"mean of the last {status.prequential_pairs}, measurement noise included")
     facts.add_row("expected", _expected(status))
@@ -167,12 +167,12 @@ def _expected(status: LearnerStatus) -> str:
 
 
 def _change(status: LearnerStatus) -> Iterator[str]:
-    since, change = f"{status.pairs_since_change} pairs since", status.last_change
+    since, change = f"{status.pairs_since_change} samples since", status.last_change
     if change is None:
         # Rolled back, or learning was restarted.
-        yield f"none in force of {status.changes} reported or detected; {status.pairs_since_change} pairs count"
+        yield f"none in force of {status.changes} reported or detected; {status.pairs_since_change} samples count"
         return
-    when = f"at pair {change.first_seq}"
+    when = f"at sample {change.first_seq}"
     if change.earliest_seq < change.latest_seq:
         when += f" ({change.earliest_seq} to {change.latest_seq})"
     moved = "" if change.moved_m is None else f", marker moved by {mm(change.moved_m)}"
@@ -211,7 +211,7 @@ def _duration(seconds: float) -> str:
 def _orientation(status: OrientationStatus) -> str:
     errors = ", ".join(f"{name} {degrees(error)}" for name, error in status.prequential_rad.items())
     return (
-        f"{status.answering} answers, of {status.pairs} pairs; new pairs: {errors}; "
+        f"{status.answering} answers, of {status.pairs} samples; new samples: {errors}; "
         f"claimed {degrees(status.claimed_rad)} from the truth where data is"
     )
 

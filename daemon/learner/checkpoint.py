@@ -233,9 +233,9 @@ def resume_from_checkpoint(
             problems.append(f"{why}. It was kept as {set_aside(file)}")
             continue
         pairs = learning.counters.pairs
-        log.info("went on from %s with %d pairs", file, pairs)
+        log.info("went on from %s with %d samples", file, pairs)
         return learning, _log_problems(
-            [*problems, f"the learner went on from {file} with {pairs} pairs"]
+            [*problems, f"the learner went on from {file} with {pairs} samples"]
         ) if problems else None
     return new(), _log_problems(
         [*problems, "the learner learns again from the sampler's history"]

@@ -170,7 +170,7 @@ class PairFeed:
             except (BusError, RequestError) as error:
                 log.debug("history could not be asked: %s", error)
                 if isinstance(error, RequestError):
-                    self.problem = f"the sampler does not give the pairs from {begin} on: {error}"
+                    self.problem = f"the sampler does not give the samples from {begin} on: {error}"
                 self._retry_at = self._clock.now() + Waits.retry_s
                 return
             self._note_stored(reply)
@@ -186,7 +186,7 @@ class PairFeed:
             return True
         if reply.last_seq < self._cursor:
             self.problem = (
-                f"the sampler's store ends at pair {reply.last_seq}, but {self._cursor} were learnt: it is an older "
+                f"the sampler's store ends at sample {reply.last_seq}, but {self._cursor} were learnt: it is an older "
                 "copy. Put the newer one back, or send the command reset_to_prior"
             )
             self.foreign, self._behind = reply.store, False
@@ -226,7 +226,7 @@ class PairFeed:
             try:
                 pairs = self._history(reply.last_seq).pairs
             except (BusError, RequestError) as error:
-                log.debug("the newest pair could not be asked for: %s", error)
+                log.debug("the newest sample could not be asked for: %s", error)
         utc = pairs[-1].utc if pairs and isinstance(pairs[-1], PairMessage) else ""
         self._newest = _Stored(reply.last_seq, utc, self._clock.now())
 
@@ -234,7 +234,7 @@ class PairFeed:
         """Continue after pairs that the sampler no longer has; it numbers without gaps, so they existed before."""
         if missing > 0:
             log.warning(
-                "the sampler has no pairs %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "
+                "the sampler has no samples %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "
                 "disk changed them (see its health); learning continues with the next",
                 self._cursor + 1,
                 self._cursor + missing,
@@ -252,14 +252,14 @@ class PairFeed:
         return True
 
     def _refuse(self, error: RequestError) -> None:
-        log.warning("a pair was refused: %s", error)
+        log.warning("a sample was refused: %s", error)
         self.refused = str(error)
         self._learning.refuse()
 
     def _note_foreign_store(self, store: str) -> None:
         self.foreign = store
         self.problem = (
-            f"pairs now come from the store {store}, but this learner learnt from {self._store}; they are not mixed. "
+            f"samples now come from the store {store}, but this learner learnt from {self._store}; they are not mixed. "
             "Send the command reset_to_prior to start again with the new store, or restore the old store"
         )
 

@@ -214,12 +214,13 @@ class Changes:
         previous, self._reported = self._reported, change
         if rolled_back:
             log.info(
-                "rolled back to the model before %s", "the change" if previous is None else f"pair {previous.first_seq}"
+                "rolled back to the model before %s",
+                "the change" if previous is None else f"sample {previous.first_seq}",
             )
         elif change is not None and (previous is None or previous.noticed_seq != change.noticed_seq):
             log.info("%s", self._sentence(change))
         elif change is not None and previous is not None and self._name(previous) != self._name(change):
-            log.info("the change at pair %d is %s", change.first_seq, self._name(change))
+            log.info("the change at sample %d is %s", change.first_seq, self._name(change))
 
     def status(self, change: ChangeRecord | None, *, can_roll_back: bool) -> Change | None:
         """Return the change for the status; None: there was none."""
@@ -244,10 +245,10 @@ class Changes:
 
     def _sentence(self, change: ChangeRecord) -> str:
         if not change.found:
-            return f"tool changed before pair {change.first_seq}, as reported by the command tool_changed"
+            return f"tool changed before sample {change.first_seq}, as reported by the command tool_changed"
         moved = "" if change.moved_m is None else f", marker moved by {1e3 * change.moved_m:.1f} mm"
         return (
-            f"change found at pair {change.first_seq} ({change.earliest_seq} to {change.latest_seq}, noticed at "
+            f"change found at sample {change.first_seq} ({change.earliest_seq} to {change.latest_seq}, noticed at "
             f"{change.noticed_seq}): {self._name(change)}{moved}"
         )
 

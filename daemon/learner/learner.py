@@ -198,7 +198,7 @@ class Learner:
     def _health(self) -> Iterator[str]:
         if not self._sampler_alive:
             yield (
-                f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
+                f"no sampler on {self._config.tables.zenoh.sampler}, so no new samples; start it with "
                 "`bodyschema run sampler`. Predictions go on"
             )
         for problem in (self._feed.problem, self._checkpoint_problem, self._restore_problem, self._calibration_problem):
@@ -210,12 +210,12 @@ class Learner:
             age_s = self._feed.age_s(self._learning.snapshot.newest_utc)
             newest = "" if age_s is None else f", and the newest that was learnt is {age_s:.0f} s old"
             yield (
-                f"{behind} stored pairs are not learnt yet{newest}: predictions are of that time. It catches up by "
-                "itself while pairs come more slowly than they are learnt; if the number grows, lower [learner] "
+                f"{behind} stored samples are not learnt yet{newest}: predictions are of that time. It catches up by "
+                "itself while samples come more slowly than they are learnt; if the number grows, lower [learner] "
                 "replays_per_pair or run the learner on a faster machine"
             )
         if self._feed.refused is not None:
-            yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
+            yield f"samples were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
         if self._nominal.size > SolverSettings.largest_net:
             yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
 
@@ -260,11 +260,11 @@ class Learner:
 
     def _pause(self) -> str:
         self._feed.pause()
-        return "no pairs are learnt until resume; predictions go on"
+        return "no samples are learnt until resume; predictions go on"
 
     def _resume(self) -> str:
         self._feed.resume()
-        return "pairs are learnt again, those missed first"
+        return "samples are learnt again, those missed first"
 
     def _reset_to_prior(self) -> str:
         with self._feed.lock:
@@ -275,8 +275,8 @@ class Learner:
         self._feed.wake()
         self.checkpoint()
         if foreign is not None:
-            return f"the learner starts again with the pairs of the store {foreign}"
-        return "the learner is back at the nominal model; only pairs from now on count"
+            return f"the learner starts again with the samples of the store {foreign}"
+        return "the learner is back at the nominal model; only samples from now on count"
 
     def _tool_changed(self) -> str:
         with self._feed.lock:
@@ -284,7 +284,7 @@ class Learner:
             self._changes.note(self._learning.change)
         self.checkpoint()
         return (
-            "pairs with the old tool no longer count; what they taught is where learning starts again. "
+            "samples with the old tool no longer count; what they taught is where learning starts again. "
             "`bodyschema command rollback` takes it back"
         )
 
@@ -294,8 +294,8 @@ class Learner:
             self._learning.rollback()
             self._changes.note(self._learning.change, rolled_back=True)
         self.checkpoint()
-        since = "the last change" if undone is None else f"pair {undone.first_seq}"
-        return f"the model before {since} answers again; pairs since then do not count"
+        since = "the last change" if undone is None else f"sample {undone.first_seq}"
+        return f"the model before {since} answers again; samples since then do not count"
 
     def _checkpoint_now(self) -> str:
         self.checkpoint()
@@ -382,5 +382,5 @@ def status_line(status: LearnerStatus) -> str:
     """Return the learner's state as one line."""
     predicted_error = "" if status.claimed_error_m is None else f", {1e3 * status.claimed_error_m:.1f} mm claimed"
     return with_health(
-        f"{status.state}, {status.pairs} pairs, {status.answering} answers{predicted_error}", status.health
+        f"{status.state}, {status.pairs} samples, {status.answering} answers{predicted_error}", status.health
     )

@@ -85,26 +85,27 @@ def _sentences(before: Device, now: Device) -> Iterator[str]:
     joint, changed = now["joint"], {key for key in now if key in before and before[key] != now[key]}
     if "model" in changed:
         yield (
-            f"joint {joint!r} has another servo than the pairs before: {before['model']} then, {now['model']} now. "
+            f"joint {joint!r} has another servo than the samples before: {before['model']} then, {now['model']} now. "
             f"Its zero is another one: put the old one back, {OR_NEW_STORE}"
         )
         return
     for key, name in IN_SERVO.items():
         if key in changed:
             yield (
-                f"the zero of {joint!r} is not what the pairs before were measured with: {name} was {before[key]}, is "
-                f"{now[key]}. Write it back (`bodyschema servos {name}={before[key]} --joint {joint}`), {OR_NEW_STORE}"
+                f"the zero of {joint!r} is not what the samples before were measured with: {name} was {before[key]}, "
+                f"is {now[key]}. Write it back (`bodyschema servos {name}={before[key]} --joint {joint}`), "
+                f"{OR_NEW_STORE}"
             )
     for key in IN_ROBOT_TOML:
         if key in changed:
             yield (
-                f"the zero of {joint!r} is not what the pairs before were measured with: {key} in robot.toml was "
+                f"the zero of {joint!r} is not what the samples before were measured with: {key} in robot.toml was "
                 f"{before[key]}, is {now[key]}. Put it back, {OR_NEW_STORE}"
             )
     if "firmware" in changed:
         yield (
             f"the firmware of {joint!r} was {before['firmware']}, is {now['firmware']}: compare its angle in a known "
-            "pose with `bodyschema watch joints`; pairs before may have another zero"
+            "pose with `bodyschema watch joints`; samples before may have another zero"
         )
 
 
@@ -170,7 +171,7 @@ class SamplerRules:
         with self._pair_lock:
             deleted = self._store.trim(Keep(rules.keep_days, most_bytes), self._wall.utc())
         if deleted:
-            log.info("the oldest %d pairs were deleted, as [daemon] keep_days and keep_mb say", deleted)
+            log.info("the oldest %d samples were deleted, as [daemon] keep_days and keep_mb say", deleted)
 
     def _follow(self, config: Config) -> None:
         session, rules = session_of(config, self._wall), config.tables.daemon
@@ -212,4 +213,4 @@ def accept_turns(encoders: object) -> str:
         raise RequestError("no joint has lost its turn count: there is nothing to accept")
     encoders.accept_turns()
     log.info("accept_turns: the turns nearest to where the joints were are taken")
-    return "the turns nearest to where the joints were are taken; pairs go on in a new segment"
+    return "the turns nearest to where the joints were are taken; samples go on in a new segment"

@@ -59,7 +59,7 @@ def _read(raw: bytes) -> PairMessage | Unreadable:
         return decode(raw, PairMessage)
     except RequestError as error:
         seq = decode(raw, _Numbered).seq
-        return Unreadable(seq, f"pair {seq} is {error}")
+        return Unreadable(seq, f"sample {seq} is {error}")
 
 
 def answer_pairs(reader: PairReader, request: Request) -> bytes:

@@ -148,9 +148,11 @@ class ResilientWriter:
         """Current problems with the disk, in sentences."""
         problems: list[str] = []
         if self._problem is not None:
-            problems.append(f"{self._problem}. No pairs are taken until the disk does ({self._dropped} frames so far)")
+            problems.append(
+                f"{self._problem}. No samples are taken until the disk does ({self._dropped} frames so far)"
+            )
         if self._last_slow is not None and self._wall.now() - self._last_slow[0] < RepeatSettings.repeated_s:
-            problems.append(f"the disk of {self._store.file} is slow: a pair took {self._last_slow[1]:.1f} s")
+            problems.append(f"the disk of {self._store.file} is slow: a sample took {self._last_slow[1]:.1f} s")
         return problems
 
     def append(self, segment: int, q: FloatArray, fix: MarkerFix) -> Pair | None:
@@ -161,7 +163,7 @@ class ResilientWriter:
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
         if pair is not None and self._problem is not None:
-            log.info("the disk takes pairs again")
+            log.info("the disk takes samples again")
             self._problem, self._dropped = None, 0
         return pair
 
@@ -176,7 +178,7 @@ class ResilientWriter:
             return write()
         except StoreUnwritable as error:
             if self._problem is None:
-                log.error("%s; it is tried again with each pair", error)
+                log.error("%s; it is tried again with each sample", error)
             self._problem, self._dropped = str(error), self._dropped + 1
             return None
         finally:

@@ -145,7 +145,9 @@ class Sampler:
                 stack.enter_context(self._gaze)
             self._serve()
             name, endpoint = self._config.robot.name, self._config.tables.zenoh.sampler
-            log.info("the sampler of %s answers on %s; %d pairs are in %s", name, endpoint, self._seq, self._store.file)
+            log.info(
+                "the sampler of %s answers on %s; %d samples are in %s", name, endpoint, self._seq, self._store.file
+            )
             tell_parent_serving()
             try:
                 self._sample()
@@ -223,7 +225,7 @@ class Sampler:
             return
         self._ended = True
         self._service.ready()
-        log.info("the sources are through; %d pairs are in the store", self._seq)
+        log.info("the sources are through; %d samples are in the store", self._seq)
         self._publish_state()
         while not (self._stopping or self._exit_at_end):
             time.sleep(Waits.read_s)
@@ -338,7 +340,7 @@ class Sampler:
             self._resumed_at = self._source_clock.now()
         with self._pair_lock:
             self._paused = command == "pause"
-        message = "no pairs are accepted until resume" if self._paused else "pairs are accepted, in a new segment"
+        message = "no samples are accepted until resume" if self._paused else "samples are accepted, in a new segment"
         log.info("%s: %s", command, message)
         return encode(CommandReply(command, message), request.encoding)
 
@@ -366,7 +368,7 @@ class Sampler:
         self._next_status = self._wall.now() + Waits.status_every_s
         status = self.status()
         self._publish_status(encode(status))
-        line = f"{status.state}, {status.pairs} pairs, {status.pairs_per_s:.1f}/s"
+        line = f"{status.state}, {status.pairs} samples, {status.pairs_per_s:.1f}/s"
         self._service.report_status(with_health(line, status.health))
 
     def _state(self) -> str:
@@ -389,7 +391,7 @@ class Sampler:
             problems += self._cameras.health
         if self._arm_support is not None and self._arm_support.state != "on":
             problems.append(
-                f"{ZERO_FORCE} is to bear the arm ([robot] hold) and is {self._arm_support.state}: no pairs are taken"
+                f"{ZERO_FORCE} is to bear the arm ([robot] hold) and is {self._arm_support.state}: no samples are taken"
             )
         if self._bad_readings:
             problems.append(f"{self._bad_readings} encoder readings were not finite and were not used")

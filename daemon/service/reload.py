@@ -30,7 +30,7 @@ class Reload:
             restart = f"systemctl restart bodyschema-{process}@{self.config.robot.name}"
             parts.append(
                 f"{', '.join(self.needs_restart)} cannot change while the {process} runs: restart it (`{restart}`, or "
-                "Ctrl-C and again); no pair is lost by that"
+                "Ctrl-C and again); no sample is lost by that"
             )
         return ". ".join(parts) or "nothing that the process knows of is other than it was"
 

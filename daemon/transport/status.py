@@ -13,9 +13,9 @@ from .wire import SCHEMA
 
 
 class JointRange(msgspec.Struct, frozen=True):
-    """The part of one joint's range that accepted pairs have covered [rad; m for a prismatic joint]."""
+    """The part of one joint's range that accepted samples have covered [rad; m for a prismatic joint]."""
 
-    low: float  # smallest angle of all accepted pairs
+    low: float  # smallest angle of all accepted samples
     high: float  # largest
     # lower_limit, upper_limit: from the URDF
     lower_limit: float
@@ -28,21 +28,21 @@ class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):
     robot: str  # its name
     store: str  # UUID of the store
     state: str  # `running`, `paused`, `ended` (end of a recording) or `failed`
-    pairs: int  # number of the newest stored pair, which is the number of accepted pairs
+    pairs: int  # number of the newest stored sample, which is the number of accepted samples
     segment: int  # present segment
     uptime_s: float  # since the start [s]
     frames: int  # stereo frames since the start
     frames_per_s: float  # over the last second
     readings_per_s: float  # encoder readings over the last second
     pairs_per_s: float  # over the last second
-    rejected: dict[str, int]  # frames that did not become pairs, by reason
-    coverage: dict[str, JointRange]  # by joint; empty before the first pair
+    rejected: dict[str, int]  # frames that did not become samples, by reason
+    coverage: dict[str, JointRange]  # by joint; empty before the first sample
     disk_free_bytes: int  # on the store's disk
     health: list[str]  # problems; empty if none
     version: str  # of bodyschema
     servos: dict[str, ServoStatus] = {}  # by joint; empty without servos
     buses: dict[str, BusStatus] = {}  # by name; empty without servos
-    unreadable: int = 0  # corrupted pairs in the store, left out
+    unreadable: int = 0  # corrupted samples in the store, left out
     schema: int = SCHEMA
 
 
@@ -52,17 +52,17 @@ UNDECIDED = "undecided"  # a change whose cause is not known yet
 class Change(msgspec.Struct, frozen=True, kw_only=True):
     """The last change of the tool, of the camera or of a joint's offset."""
 
-    first_seq: int  # most probable first pair after it
-    # earliest_seq, latest_seq: 95 % interval of that pair
+    first_seq: int  # most probable first sample after it
+    # earliest_seq, latest_seq: 95 % interval of that sample
     earliest_seq: int
     latest_seq: int
-    noticed_seq: int  # pair at which it was detected, or the last one before it was reported
+    noticed_seq: int  # sample at which it was detected, or the last one before it was reported
     found: bool  # detected (true) or reported by a command (false)
     kind: str  # `tool`, `camera`, `joint NAME` (its offset), `other` or `undecided`
     probabilities: dict[str, float]  # by kind, those above 1 %
     # kind that is equivalent to it: the last joint's offset to a tool, the first one's to a camera; null if none
     alike: str | None
-    moved_m: float | None  # RMS displacement of the marker at the pairs since [m]; null if unknown
+    moved_m: float | None  # RMS displacement of the marker at the samples since [m]; null if unknown
     can_roll_back: bool  # the model before it is kept
 
 
@@ -74,42 +74,42 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State of the learner."""
 
     robot: str  # its name
-    store: str | None  # UUID of the pairs' store; null before any
-    state: str  # `waiting` (no pair yet), `aligning` (frame still unknown), `learning` or `paused`
-    pairs: int  # pairs learnt online, each once
+    store: str | None  # UUID of the samples' store; null before any
+    state: str  # `waiting` (no sample yet), `aligning` (frame still unknown), `learning` or `paused`
+    pairs: int  # samples learnt online, each once
     last_seq: int  # number of the newest of them
     pairs_since_change: int  # since the last change, or the start
     sampler_alive: bool  # a sampler is visible
     replayed: int  # replay steps since the start
     answering: str  # answering model: `prior`, `nlms`, `rigid`, `residual` or `exact`
-    # error on new pairs, by model: mean distance between the measurement, its noise included, and the prediction made
-    # before the pair was learnt, over the last `prequential_pairs`, the same for all models [m]
+    # error on new samples, by model: mean distance between the measurement, its noise included, and the prediction made
+    # before the sample was learnt, over the last `prequential_pairs`, the same for all models [m]
     prequential_m: dict[str, float]
     # predicted mean distance to the truth as the cameras see it, without measurement noise, where data is [m]; null
-    # until a few pairs have been predicted
+    # until a few samples have been predicted
     claimed_error_m: float | None
-    curve: list[CurvePoint]  # error on new pairs of the answering model
+    curve: list[CurvePoint]  # error on new samples of the answering model
     model: str  # its hash; empty before the first
     # camera, tool and joint offsets; null before the first solution with the present tool
     calibration: ChainCalibration | None
     outlook: DataOutlook | None  # expected gain of more data; null before such a solution
-    gaps_recovered: int  # pairs fetched from the sampler's history
-    refused: int  # unusable pairs
+    gaps_recovered: int  # samples fetched from the sampler's history
+    refused: int  # unusable samples
     doubted: int  # suspected outliers
     changes: int  # changes reported or detected
     last_change: Change | None  # the last one not rolled back; null if none
-    at_rest: bool  # all pairs are fitted, solved and replayed
+    at_rest: bool  # all samples are fitted, solved and replayed
     checkpoint_age_s: float | None  # [s]; null before the first, or after a failed one
     uptime_s: float  # since the start [s]
     health: list[str]  # problems; empty if none
     version: str  # of bodyschema
     orientation: OrientationStatus | None = None  # null without orientations with the present tool
     prequential_pairs: int = 0  # at most 50; fewer after a change or with a new model
-    missed: int = 0  # pairs no longer available from the sampler
-    behind: int = 0  # pairs stored but not yet learnt; a `health` problem from 100 on
+    missed: int = 0  # samples no longer available from the sampler
+    behind: int = 0  # samples stored but not yet learnt; a `health` problem from 100 on
     age_s: float | None = None  # as in PredictReply
-    # predicted mean error there that all pairs share, so that no pair shows it: of the cameras' calibration and of a
-    # tag's size [m]; in the sigma of predictions; null where cameras.toml does not tell
+    # predicted mean error there that all samples share, so that no sample shows it: of the cameras' calibration and
+    # of a tag's size [m]; in the sigma of predictions; null where cameras.toml does not tell
     common_error_m: float | None = None
     schema: int = SCHEMA
 

@@ -35,11 +35,11 @@ _msgpack_encoder = msgspec.msgpack.Encoder()
 
 
 class PairMessage(msgspec.Struct, frozen=True):
-    """One training pair, published once, after it was stored."""
+    """One sample, published once, after it was stored."""
 
     store: str  # UUID of the store that numbered it
     seq: Annotated[int, Meta(ge=1)]  # its number in that store, from 1, without gaps
-    segment: int  # shared by a run of pairs, each one step from its predecessor
+    segment: int  # shared by a run of samples, each one step from its predecessor
     t: float  # frame time on the sampler's monotonic clock [s]; may restart with the sampler
     utc: str  # wall-clock time of acceptance, ISO 8601
     q: list[float]  # joint angles at `t` [rad], d numbers
@@ -55,13 +55,13 @@ class PairMessage(msgspec.Struct, frozen=True):
 
 
 class PairsReply(msgspec.Struct, frozen=True):
-    """Stored pairs in order, at most 1000; `from` and `to` are inclusive and optional.
+    """Stored samples in order, at most 1000; `from` and `to` are inclusive and optional.
 
-    A reply that begins after `from` means that older pairs were deleted (`[daemon] keep_days`, `keep_mb`).
+    A reply that begins after `from` means that older samples were deleted (`[daemon] keep_days`, `keep_mb`).
     """
 
     store: str  # UUID of the store
-    last_seq: int  # newest pair in the store, 0 if empty
+    last_seq: int  # newest sample in the store, 0 if empty
     pairs: list[PairMessage]  # continue from where they end
     schema: int = SCHEMA
 
@@ -82,11 +82,11 @@ class PredictReply(msgspec.Struct, frozen=True):
     sigma: list[list[float]]  # 1-sigma per axis [m], n × 3
     in_support: list[bool]  # false where extrapolated, away from all data
     model: str  # hash of the answering model
-    pairs: int  # pairs that it has learnt
-    # age of the newest learnt pair: from it to the newest pair known to be stored, plus the time since the learner
-    # heard of that one [s]; null before any pair
+    pairs: int  # samples that it has learnt
+    # age of the newest learnt sample: from it to the newest sample known to be stored, plus the time since the learner
+    # heard of that one [s]; null before any sample
     age_s: float | None
-    R: list[list[float]] | None = None  # marker orientations, n × 4; null where no pair with the present tool had one
+    R: list[list[float]] | None = None  # marker orientations, n × 4; null where no sample with the present tool had one
     sigma_R: list[list[float]] | None = None  # 1-sigma of a small rotation about each axis [rad], n × 3; null with `R`
     # the rows once more, in the form of all messages, with the covariances of `sigma` and `sigma_R`; null from a
     # learner of an earlier version
@@ -99,7 +99,7 @@ class JacobianReply(msgspec.Struct, frozen=True):
 
     J: list[list[list[float]]]  # a 3 × d matrix for each row of the request [m/rad]
     model: str  # hash of the answering model
-    pairs: int  # pairs that it has learnt
+    pairs: int  # samples that it has learnt
     schema: int = SCHEMA
 
 
@@ -128,7 +128,7 @@ class IkReply(msgspec.Struct, frozen=True):
     sigma: list[float]  # 1-sigma of `x` per axis against the truth [m]
     in_support: bool  # `q` lies where data was
     model: str  # hash of the answering model
-    pairs: int  # pairs that it has learnt
+    pairs: int  # samples that it has learnt
     # the predicted pose at `q`, as `predict` has it; null from a learner of an earlier version
     pose: MarkerPose | None = None
     schema: int = SCHEMA
@@ -231,11 +231,11 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
     q = np.array(message.q)
     numbers = np.concatenate([q, message.x, message.cov, [message.t], message.R or (), message.cov_R or ()])
     if len(q) != joints:
-        raise RequestError(f"pair {message.seq} has {len(q)} joint angles, this robot has {joints}")
+        raise RequestError(f"sample {message.seq} has {len(q)} joint angles, this robot has {joints}")
     if not np.isfinite(numbers).all():
-        raise RequestError(f"pair {message.seq} has a number that is not finite")
+        raise RequestError(f"sample {message.seq} has a number that is not finite")
     if message.R is not None and abs(math.hypot(*message.R) - 1.0) > ColumnLimits.quaternion_tolerance:
-        raise RequestError(f"pair {message.seq} has an R of the length {math.hypot(*message.R):.6g}, not 1")
+        raise RequestError(f"sample {message.seq} has an R of the length {math.hypot(*message.R):.6g}, not 1")
     return Pair(
         store=message.store,
         seq=message.seq,

@@ -286,9 +286,9 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     if unknown_side > DiagnosisSettings.max_doubtful:
         joints = ", ".join(str(cause.where) for cause in sided)
         sentences.append(
-            f"At {100.0 * unknown_side:.0f} % of the pairs it is unknown on which side of its backlash {joints} rests: "
-            "few runs cross it. What seems to jump or to change with time there may be that. Record longer runs, "
-            "and move the joint to and fro in each."
+            f"At {100.0 * unknown_side:.0f} % of the samples it is unknown on which side of its backlash {joints} "
+            "rests: few runs cross it. What seems to jump or to change with time there may be that. Record longer "
+            "runs, and move the joint to and fro in each."
         )
     if diagnosis.leaves_out or len(diagnosis.stored.causes) < len(diagnosis.causes):
         sentences.append(_left_out(diagnosis.stored))

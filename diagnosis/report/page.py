@@ -84,7 +84,7 @@ def _head(file: DiagnosisFile, about: About) -> str:
     name, meaning = _VERDICTS[file.verdict]
     found, _, figures = file.sentence.rstrip(".").partition(". ")
     return (
-        f'<header><p class="of">{escape(about.robot)} · {escape(about.recording)} · {file.pairs.total:,} pairs</p>'
+        f'<header><p class="of">{escape(about.robot)} · {escape(about.recording)} · {file.pairs.total:,} samples</p>'
         f'<h1><span class="verdict {file.verdict}">{name}</span> {escape(found)}.</h1>'
         f"<p>{escape(figures)}{'. ' if figures else ''}{meaning}</p>{_unexplained(file)}</header>"
     )
@@ -149,7 +149,7 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
         articles[-more:] = [f"<details><summary>{corrections(more).capitalize()}</summary>{folded}</details>"]
     return (
         f'<section id="causes"><h2>Causes</h2>{tables.causes(file, timed=residuals.timed)}'
-        '<p class="key">In the plots: pale dots are single pairs, strong dots their means with 95 % intervals, the '
+        '<p class="key">In the plots: pale dots are single samples, strong dots their means with 95 % intervals, the '
         f'<span class="fitted">line</span> what was fitted.</p>{"".join(articles)}</section>'
     )
 
@@ -206,7 +206,7 @@ def _against(residuals: Residuals) -> str:
             f'<div class="panels">{_panels(silent)}</div></details>'
         )
     return (
-        f'<section id="against"><h2>What the error depends on</h2><p>{_KEY} Pale dots are single pairs, strong dots '
+        f'<section id="against"><h2>What the error depends on</h2><p>{_KEY} Pale dots are single samples, strong dots '
         "means with 95 % intervals. An error along a joint is counted on the way on which that joint moves the "
         f"marker.</p>{shown}{folded}</section>"
     )
@@ -235,12 +235,12 @@ def _done(diagnosis: Diagnosis, file: DiagnosisFile, about: About) -> str:
     return (
         '<section id="method"><h2>What was done</h2>'
         f"<p>{len(diagnosis.hypotheses.effects)} hypotheses, each effect at each place where it can sit, were tried "
-        "as extensions of the simulation, alone and beside each other. Their numbers were fitted to all pairs together "
-        "by maximum likelihood, with a share of outliers. An effect was added if it made the data more probable by "
-        "more than its freedom and the number of trials explain, and removed when others made it redundant. Every "
-        f"error on this page is of held-out pairs: {diagnosis.blocks.count} blocks of time, left out in turn. "
-        f"Intervals of gains are from a bootstrap over blocks: neighbouring pairs are not independent.</p>{left_out}"
-        f'<p class="of">bodyschema {escape(about.version)}, {file.pairs.total:,} pairs of {escape(about.recording)}, '
+        "as extensions of the simulation, alone and beside each other. Their numbers were fitted to all samples "
+        "together by maximum likelihood, with a share of outliers. An effect was added if it made the data "
+        "more probable by more than its freedom and the number of trials explain, and removed when others made it redundant. Every "
+        f"error on this page is of held-out samples: {diagnosis.blocks.count} blocks of time, left out in turn. "
+        f"Intervals of gains are from a bootstrap over blocks: neighbouring samples are not independent.</p>{left_out}"
+        f'<p class="of">bodyschema {escape(about.version)}, {file.pairs.total:,} samples of {escape(about.recording)}, '
         f"seed {diagnosis.seed}.</p></section>"
     )
 

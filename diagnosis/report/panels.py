@@ -186,7 +186,7 @@ def histogram(residuals: Residuals) -> Panel:
         for look, lengths in (("before", before), ("after", after), ("noise", noise))
     }
     top = max(float(share.max()) for share in shares.values())
-    plot = Plot("error [mm]", "share of the pairs [%]", (0.0, end), (0.0, 1.06 * top))
+    plot = Plot("error [mm]", "share of the samples [%]", (0.0, end), (0.0, 1.06 * top))
     marks = [plot.area(middle, shares[look], look) for look in ("before", "after")]
     return Panel(
         "How large the errors are: before, after, and what noise alone would be (line)",

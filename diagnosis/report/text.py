@@ -166,7 +166,7 @@ def sentence(
         return f"{text}; small errors everywhere and a smooth model of the rest explain {_share(gain)} ({figures})"
     head = _head(causes, tolerances, seen_by, timed=timed, weighed=weighed)
     if gain.held_out_percent <= 0.0:
-        return f"{head}: this explains the pairs that were fitted and no others ({figures})"
+        return f"{head}: this explains the samples that were fitted and no others ({figures})"
     if named_mm is not None:
         figures += f", {named_mm:.3g} mm without the smooth model of the rest"
     elif tolerated_mm is not None and tolerated_mm < _Settings.by_tolerances * rms.aligned:
@@ -288,7 +288,7 @@ def modelled(rest: Unexplained) -> str:
         over = "the marker's place" if rest.model_joints == PLACE else f"the readings of {', '.join(rest.model_joints)}"
         sentences.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
     elif rest.what:
-        why = ": none that it can hold is right on pairs that were not fitted. More pairs may tell one"
+        why = ": none that it can hold is right on samples that were not fitted. More samples may tell one"
         sentences.append(f"extended.toml has no model of it{'' if rest.not_in_model else why}.")
     if rest.not_in_model:
         sentences.append(

@@ -14,7 +14,7 @@ ID, BAUD, HOMING_OFFSET = "id", "baud", "homing_offset"
 LARGEST_ID = 252  # 253 is legal, but no robot.toml can name it
 RENAMED = "set id in robot.toml"
 OTHER_RATE = "set baud in robot.toml; all servos of a bus need the same"
-OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those after"
+OTHER_ZERO = "the joint's zero moves: samples measured before do not fit those after"
 
 
 @dataclass(frozen=True, slots=True)

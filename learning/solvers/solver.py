@@ -281,7 +281,7 @@ def fitted_residual(
             learner.weigh(cov[chosen])
         return learner.model
     except (np.linalg.LinAlgError, NonFiniteError) as error:
-        log.warning("the chain with residual has no solution for %d pairs: %s", len(q), error)
+        log.warning("the chain with residual has no solution for %d samples: %s", len(q), error)
         return None
 
 

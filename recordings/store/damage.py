@@ -56,7 +56,7 @@ class Damage:
     def sentence(self, file: Path) -> str:
         """Return a sentence with the numbers and the remedy."""
         one = self.count == 1
-        many, they = ("1 pair", "It is") if one else (f"{self.count} pairs", "They are")
+        many, they = ("1 sample", "It is") if one else (f"{self.count} samples", "They are")
         return (
             f"{many} of {file} cannot be read: the disk changed what was written. {they} left out "
             f"(number{'' if one else 's'} {self}). Check the disk and write a backup"

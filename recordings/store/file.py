@@ -38,7 +38,7 @@ def explanation(file: Path, error: sqlite3.Error) -> str:
     if name.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN")):
         return unwritable(file, errno.EROFS, str(error))
     if name.startswith("SQLITE_NOTADB"):
-        return f"{file} is not a pair store. Move it away, or give another --state-dir. {NOTHING_CHANGED}"
+        return f"{file} is not a sample store. Move it away, or give another --state-dir. {NOTHING_CHANGED}"
     if is_damage(error):
         return damaged(file, str(error))
     return f"{file}: {error} ({name or type(error).__name__}). Check the disk"

@@ -118,7 +118,7 @@ def check_kind(connection: sqlite3.Connection, file: Path) -> None:
     """Raise StoreError if `file` is not a pair store, has a newer version, or has other tables."""
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise StoreError(
-            f"{file} is not a pair store but another SQLite file. Move it away, or give another --state-dir. "
+            f"{file} is not a sample store but another SQLite file. Move it away, or give another --state-dir. "
             f"{NOTHING_CHANGED}"
         )
     found = version(connection)
@@ -239,7 +239,7 @@ def _schema_mismatch(connection: sqlite3.Connection, schema: int) -> str | None:
         return "its texts are not UTF-8"
     trigger = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'trigger'").fetchone()
     if trigger is not None:
-        return "it has a trigger, which a pair store has not"
+        return "it has a trigger, which a sample store has not"
     with contextlib.closing(sqlite3.connect(":memory:")) as sound:
         sound.text_factory = bytes
         for statement in statements_of(schema):

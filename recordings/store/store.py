@@ -129,7 +129,7 @@ class PairReader:
                 meta = store_schema.meta(self._connection)
             except ValueError as error:
                 self._close()
-                what = f"{self.file} is damaged ({error}). Start the sampler: it puts the pairs into a new file"
+                what = f"{self.file} is damaged ({error}). Start the sampler: it puts the samples into a new file"
                 raise StoreError(what) from error
             except BaseException:
                 self._close()
@@ -465,7 +465,7 @@ class PairStore:
     def _check_joints(self, stored: tuple[str, ...]) -> None:
         if stored != self._session.joints:
             raise StoreError(
-                f"{self.file} holds pairs of the joints {', '.join(stored)}; robot.toml has "
+                f"{self.file} holds samples of the joints {', '.join(stored)}; robot.toml has "
                 f"{', '.join(self._session.joints)}. Give this robot a state_dir of its own (--state-dir), "
                 f"or move the file away. {NOTHING_CHANGED}"
             )

@@ -195,7 +195,7 @@ KINDS: dict[str, Kind] = {
         _drift,
         0.1,
         "measured minus true position at the drift's end, in the measurement frame; before that times 1 − exp(−t/tau), "
-        "t since the first pair",
+        "t since the first sample",
     ),
     "outliers": Kind("robot", (), _outliers, 1.0, "fraction of the fixes that are not the marker"),
 }

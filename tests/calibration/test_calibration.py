@@ -138,13 +138,13 @@ def test_outliers_are_counted_and_left_out() -> None:
 
 
 def test_too_few_pairs_are_rejected() -> None:
-    with pytest.raises(CalibrationError, match="7 pairs are too few to calibrate 4 joints; record at least 8"):
+    with pytest.raises(CalibrationError, match="7 samples are too few to calibrate 4 joints; record at least 8"):
         planted(1, pairs=7).calibrated()
 
 
 def test_camera_and_tool_alone_need_fewer_pairs() -> None:
     found = planted(0, pairs=7).calibrated(trusted="urdf")
-    with pytest.raises(CalibrationError, match="5 pairs are too few to calibrate 4 joints; record at least 6"):
+    with pytest.raises(CalibrationError, match="5 samples are too few to calibrate 4 joints; record at least 6"):
         planted(0, pairs=5).calibrated(trusted="urdf")
     assert found.learner.inliers.all()
 
@@ -158,7 +158,7 @@ def test_first_offset_is_unidentifiable_from_distant_instrument() -> None:
 
 
 def test_many_outliers_are_mentioned_with_their_rows() -> None:
-    assert "20 % of the pairs do not fit" in said(planted(0, outliers=20))
+    assert "20 % of the samples do not fit" in said(planted(0, outliers=20))
     assert "(the longest run: number 1 to 20)" in said(planted(0, outliers=20))
     assert "do not fit" not in said(planted(0, outliers=5))
 
@@ -208,7 +208,7 @@ def corner() -> CalibrationReport:
 
 def test_twelve_nearby_pairs_yield_no_manufacturing_accuracy(corner) -> None:
     assert (corner.axes_deg, corner.points_mm) == (None, None)
-    assert "These pairs do not show how accurately the arm is made" in "\n".join(sentences(corner))
+    assert "These samples do not show how accurately the arm is made" in "\n".join(sentences(corner))
 
 
 def test_twelve_nearby_pairs_determine_few_parameters(corner) -> None:
@@ -353,13 +353,15 @@ def test_bag_positions_are_not_of_the_configured_cameras(tmp_path, taken, elsewh
 def test_a_store_of_other_joints_is_refused() -> None:
     recording = planted(1).recording
     with pytest.raises(
-        RecordingError, match=r"pairs.sqlite: the pairs are of other joints: base_yaw, .*this one has a"
+        RecordingError, match=r"pairs.sqlite: the samples are of other joints: base_yaw, .*this one has a"
     ):
         of_robot(recording, ("a", "b"), Path("pairs.sqlite"))
 
 
 def test_urdf_export_of_pairs_points_to_calibrate(pairs_file, tmp_path) -> None:
-    with pytest.raises(RecordingError, match=r"a URDF is of a robot, not of pairs. `bodyschema calibrate` learns one"):
+    with pytest.raises(
+        RecordingError, match=r"a URDF is of a robot, not of samples. `bodyschema calibrate` learns one"
+    ):
         app(["export", str(pairs_file), str(tmp_path / "arm.urdf")], exit_on_error=False)
 
 
@@ -523,7 +525,7 @@ def test_each_tool_can_be_calibrated_alone(pairs_file, capsys) -> None:
 
 
 def test_missing_rows_are_reported(pairs_file) -> None:
-    with pytest.raises(RecordingError, match=r"no pairs from number 101 on; the last one is 100"):
+    with pytest.raises(RecordingError, match=r"no samples from number 101 on; the last one is 100"):
         called(pairs_file, "--first", 101)
 
 

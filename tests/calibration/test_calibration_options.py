@@ -105,7 +105,7 @@ def test_wrong_trusted_urdf_is_reported() -> None:
 def test_errors_of_trusted_urdf_are_not_called_noise() -> None:
     told = " ".join(sentences(report_on(calibrated("with offsets", "urdf"))))
     assert "Noise and errors of the URDF in a coordinate" in told
-    assert len(re.findall(r"Mean distance to the pairs: [\d.]+ mm\.", told)) == 1
+    assert len(re.findall(r"Mean distance to the samples: [\d.]+ mm\.", told)) == 1
 
 
 def test_a_urdf_that_is_right_is_not_doubted() -> None:

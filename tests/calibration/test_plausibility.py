@@ -291,7 +291,7 @@ def test_degrees_are_named_however_small() -> None:
 
 def test_a_refusal_gives_both_errors_and_the_remedy() -> None:
     found = misread("the zero of q2 is about 90° off")
-    assert "the pairs then fit to" in (found.refusal or "")
+    assert "the samples then fit to" in (found.refusal or "")
     assert "and as they are to" in (found.refusal or "")
     assert found.remedy.startswith("Add -90° to the readings of q2")
 
@@ -326,7 +326,7 @@ def test_marginally_better_reading_of_few_rows_only_warns() -> None:
     found = pairs(noise=0.035).read(MISREAD["q3 counts the other way"]).seen(rows=30)
     assert found.refusal is None
     assert "q3 counts the other way" in found.warnings[0]
-    assert "These are 30 pairs" in found.warnings[0]
+    assert "These are 30 samples" in found.warnings[0]
 
 
 @pytest.mark.parametrize("rows", [14, 30])
@@ -556,7 +556,7 @@ def test_inexplicable_reading_gets_no_name() -> None:
 
 def test_equally_good_reading_is_reported_too() -> None:
     found = pairs().read(replace(PLAIN, signs=(1, 1, 1, 1, 1, -1), mirrored=True)).seen()
-    assert "These pairs fit as well if " in found.remedy
+    assert "These samples fit as well if " in found.remedy
 
 
 @pytest.mark.parametrize("off", [45, pytest.param(-45, marks=pytest.mark.soak)])

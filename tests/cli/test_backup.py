@@ -333,7 +333,7 @@ def test_an_encrypted_archive_is_refused(backed_up, elsewhere) -> None:
 def test_a_state_dir_elsewhere_is_asked_for(backed_up, elsewhere, folder, tmp_path) -> None:
     archive = altered(backed_up, described(lambda text: text.replace('"state"', json.dumps(folder))))
     where = "in a hidden folder" if folder.startswith(".git") else "outside of its folder"
-    assert f"keeps pairs and checkpoint {where}. Nothing was changed. Give --state-dir" in refused(archive, elsewhere)
+    assert f"keeps samples and checkpoint {where}. Nothing was changed. Give --state-dir" in refused(archive, elsewhere)
     with Backup(archive) as backup:
         restore(backup, elsewhere, tmp_path / "given")
     assert len(stored(tmp_path / "given" / "pairs.sqlite")) == PAIRS
@@ -410,9 +410,9 @@ def test_a_backup_leaves_out_changed_pairs(config, file, elsewhere, capsys) -> N
     for words in (["backup", file, "--robot", config.file], ["backup", file, "--restore", "--robot", elsewhere]):
         command_line(words[0])(list(map(str, words)), exit_on_error=False, result_action="return_value")
     shown = capsys.readouterr().out
-    assert f"{file}: arm, 18 pairs to number 20" in shown
-    assert "2 pairs cannot be read and are not in it" in shown
-    assert "2 pairs between could not be read when it was written" in shown
+    assert f"{file}: arm, 18 samples to number 20" in shown
+    assert "2 samples cannot be read and are not in it" in shown
+    assert "2 samples between could not be read when it was written" in shown
     assert config.store_file.read_bytes() == before
     with PairReader(elsewhere.parent / "state" / "pairs.sqlite") as pairs:
         audit = pairs.audit()
@@ -558,5 +558,5 @@ def test_the_commands_go_there_and_back(config, file, elsewhere, capsys) -> None
     for words in (["backup", file, "--robot", config.file], ["backup", file, "--restore", "--robot", elsewhere]):
         command_line(words[0])(list(map(str, words)), exit_on_error=False, result_action="return_value")
     shown = capsys.readouterr().out
-    assert f"{file}: arm, 20 pairs to number 20, no checkpoint yet" in shown
+    assert f"{file}: arm, 20 samples to number 20, no checkpoint yet" in shown
     assert f"  {elsewhere}\n" in shown

@@ -292,7 +292,7 @@ def test_prediction_without_pairs_fails_for_unknown_camera_pose(lonely_learner) 
     said = refused("predict", "--", "0.1", "-0.2", cwd=lonely_learner.file.parent)
     assert said == (
         "there is no model yet: robot.toml says [camera] pose_known = false, so positions have no frame until about "
-        "10 pairs have come (0 so far). Start the sampler with `bodyschema run sampler` and guide the arm"
+        "10 samples have come (0 so far). Start the sampler with `bodyschema run sampler` and guide the arm"
     )
 
 
@@ -328,7 +328,7 @@ def test_learner_without_sampler_names_endpoint_and_start_command(lonely_learner
     status = learner_status(lonely_learner)
     assert (status.state, status.sampler_alive) == ("waiting", False)
     assert status.health[0] == (
-        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new pairs; start it with `bodyschema run "
+        f"no sampler on {lonely_learner.tables.zenoh.sampler}, so no new samples; start it with `bodyschema run "
         "sampler`. Predictions go on"
     )
 

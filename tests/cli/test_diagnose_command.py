@@ -278,7 +278,7 @@ def test_the_running_samplers_pairs_are_diagnosed(live_robot, endpoint, recordin
 def test_live_diagnosis_reports_a_sampler_without_pairs(live_robot, endpoint, recording) -> None:
     with ZenohSession(listen=endpoint) as bus:
         Sampler(bus, "desk_arm", recording).pairs.clear()
-        assert "the sampler has no pairs yet" in refused("--live", "--robot", live_robot)
+        assert "the sampler has no samples yet" in refused("--live", "--robot", live_robot)
 
 
 def test_live_diagnosis_reports_a_missing_sampler(live_robot) -> None:
@@ -382,7 +382,7 @@ def test_positions_unrelated_to_the_arm_are_refused(recording, tmp_path) -> None
 def test_too_few_pairs_are_counted(recording, tmp_path) -> None:
     file = tmp_path / "few.csv"
     recording.rows(np.arange(12)).write_csv(file)
-    assert "12 pairs are too few" in refused(file, "--robot", DESK_ARM)
+    assert "12 samples are too few" in refused(file, "--robot", DESK_ARM)
 
 
 def test_latency_diagnosis_of_untimed_recording_is_refused(robot, tmp_path) -> None:

@@ -241,13 +241,13 @@ def changed(file: Path, statement: str) -> Check:
 
 def test_sound_store_is_reported_as_sound(stored) -> None:
     (check,) = doctor.store_checks(stored)
-    assert (check.state, check.said) == ("ok", f"all 5 pairs in {stored} are as they were written")
+    assert (check.state, check.said) == ("ok", f"all 5 samples in {stored} are as they were written")
 
 
 def test_changed_pair_is_reported_by_number(stored) -> None:
     check = changed(stored, "UPDATE pairs SET q = '[0.3]' WHERE seq = 3")
     assert check.state == "warning"
-    assert "1 pair of" in check.said
+    assert "1 sample of" in check.said
     assert "(number 3)" in check.said
 
 

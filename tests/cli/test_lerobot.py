@@ -269,7 +269,7 @@ def test_a_second_recording_is_noted_beside_the_first(tmp_path) -> None:
         False,
     ]
     assert "follower.json.before2" in corrected.already_written(files[1])[0]
-    (tmp_path / "first.csv-wal").write_text("later pairs of a store")
+    (tmp_path / "first.csv-wal").write_text("later samples of a store")
     assert corrected.already_written(files[0]) == []
 
 

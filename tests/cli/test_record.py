@@ -73,7 +73,7 @@ def record(*arguments: object) -> None:
 def test_missing_pair_numbers_are_reported(sampler, robot, tmp_path, capsys) -> None:
     sampler.pairs = [pair(seq) for seq in (3, 4, 7, 8, 10)]
     record(tmp_path / "a.csv", "--robot", robot)
-    assert "3 pairs between them are missing (numbers 5 to 6, 9)" in capsys.readouterr().out
+    assert "3 samples between them are missing (numbers 5 to 6, 9)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
@@ -97,7 +97,7 @@ def test_copying_begins_at_the_requested_pair(sampler: FakeSampler, robot: Path,
 
 
 def test_without_pairs_no_file_is_left(sampler: FakeSampler, robot: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="no pairs from number 1"):
+    with pytest.raises(RecordingError, match="no samples from number 1"):
         record(tmp_path / "a.csv", "--robot", robot)
     assert not (tmp_path / "a.csv").exists()
 
@@ -154,7 +154,7 @@ def test_orientations_are_copied_where_every_pair_has_one(sampler, robot, tmp_pa
 def test_following_csv_ends_where_orientations_begin(history, sampler, tmp_path) -> None:
     sampler.pairs = [pair(1), pair(2), turned(3), turned(4)]
     with pytest.raises(
-        RecordingError, match=r"from pair 3 to 4 some have a marker orientation and some do not. The 2 rows so far"
+        RecordingError, match=r"from sample 3 to 4 some have a marker orientation and some do not. The 2 rows so far"
     ):
         follow_history(history, robot_in(tmp_path), tmp_path / "a.csv", lambda: history.next_seq > 4)
     assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2

@@ -174,7 +174,8 @@ def test_report_states_that_errors_include_measurement_noise() -> None:
     said = " ".join(as_text(report()).split())
     assert "the errors above count the noise of the measurements" in said
     assert (
-        "on new pairs where data is the learner expects 0.31 mm; its 1-sigma and that noise together cover 88%" in said
+        "on new samples where data is the learner expects 0.31 mm; its 1-sigma and that noise together cover 88%"
+        in said
     )
 
 

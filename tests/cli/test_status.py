@@ -66,7 +66,7 @@ def sampler_running(config: Config) -> Iterator[None]:
         "sampler of arm is paused, up for 1 min 15 s",
         "700, 29.9/s; readings 120/s",
         "612 in 3 segments, 12.3/s",
-        "rejected 80 hardly any motion since the last pair, 8 at the border",
+        "rejected 80 hardly any motion since the last sample, 8 at the border",
         "! the disk is nearly full",
         "-29° … +29°",
         "learner of arm is learning, up for 1 h 06 min",
@@ -77,9 +77,9 @@ def sampler_running(config: Config) -> Iterator[None]:
         "expected 6.9 mm where data is, 4.7 mm over all joints' ranges",
         "4120 stored and not learnt yet; the newest learnt is 2 min 17 s old",
         "`bodyschema command rollback` goes back to the model before it",
-        "change undecided at pair 601 (598 to 602), marker moved by 10.4 mm (found); 12",
+        "change undecided at sample 601 (598 to 602), marker moved by 10.4 mm (found); 12",
         "tool 61%, joint shoulder 38%",
-        "enough? no: 300 more pairs like these take 17% off the error beyond noise",
+        "enough? no: 300 more samples like these take 17% off the error beyond noise",
         "300 of moving shoulder over its range: 50%",
         "camera on base_link [mm] -11 ± 11 +20 ± 33 +10 ± 43",
         "zeros to add shoulder +3.7 ± 3.5°",
@@ -99,12 +99,12 @@ def test_user_reported_tool_change_is_shown_as_reported(config) -> None:
         LEARNER.last_change, found=False, kind="tool", earliest_seq=601, latest_seq=601, moved_m=None
     )
     text = " ".join(shown(ProcessStates(None, msgspec.structs.replace(LEARNER, last_change=change)), config).split())
-    assert "change tool at pair 601 (told); 12 pairs since" in text
+    assert "change tool at sample 601 (told); 12 samples since" in text
 
 
 def test_rolled_back_change_is_not_in_force(config) -> None:
     learner = msgspec.structs.replace(LEARNER, changes=2, last_change=None, pairs_since_change=600)
-    assert "change none in force of 2 reported or detected; 600 pairs count" in " ".join(
+    assert "change none in force of 2 reported or detected; 600 samples count" in " ".join(
         shown(ProcessStates(None, learner), config).split()
     )
 

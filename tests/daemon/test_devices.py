@@ -79,7 +79,7 @@ def test_each_session_keeps_device_record_of_its_pairs(file) -> None:
         ({"homing_offset_ticks": 100}, "homing_offset was 0, is 100.*servos homing_offset=0 --joint elbow"),
         ({"drive_mode": 1}, "drive_mode was 0, is 1"),
         ({"firmware": 47}, "the firmware of 'elbow' was 46, is 47"),
-        ({"model": "XM540-W270"}, "another servo than the pairs before: XM430-W350 then, XM540-W270 now"),
+        ({"model": "XM540-W270"}, "another servo than the samples before: XM430-W350 then, XM540-W270 now"),
         ({"zero_ticks": 1000}, "zero_ticks in robot.toml was 2048, is 1000"),
     ],
 )

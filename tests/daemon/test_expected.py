@@ -67,7 +67,7 @@ class Model:
 
     def predict(self, q) -> Prediction:
         if not self.has_frame:
-            raise NoFrameError("too few pairs")
+            raise NoFrameError("too few samples")
         return Prediction(np.array([[1.0, 2.0, 3.0]]), np.array([[0.1, 0.2, 0.3]]), np.array([self.in_support]))
 
 

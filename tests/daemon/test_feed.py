@@ -181,7 +181,7 @@ def test_new_learner_starts_at_oldest_kept_pair(caplog) -> None:
     fed.settle()
     assert fed.learnt == (8, 20)
     assert fed.learning.counters.missed == 12
-    assert "has no pairs 1 to 12 any more" in caplog.text
+    assert "has no samples 1 to 12 any more" in caplog.text
 
 
 def test_returning_learner_continues_and_counts_missed_pairs() -> None:
@@ -257,7 +257,7 @@ def test_pairs_of_another_store_are_rejected_with_remedy() -> None:
     fed.publish(make_pair(6, PAIRS[5].q, PAIRS[5].x, store="other"))
     fed.settle()
     assert fed.learnt == (5, 5)
-    assert "pairs now come from the store other" in fed.feed.problem
+    assert "samples now come from the store other" in fed.feed.problem
     assert "reset_to_prior" in fed.feed.problem
 
 
@@ -268,7 +268,7 @@ def test_older_copy_of_store_is_reported() -> None:
     fed.feed.wake()
     fed.settle()
     assert fed.learnt == (10, 10)
-    assert "ends at pair 4, but 10 were learnt: it is an older copy" in fed.feed.problem
+    assert "ends at sample 4, but 10 were learnt: it is an older copy" in fed.feed.problem
 
 
 @pytest.mark.parametrize("spoilt", [[7], [1], [6, 7, 8], [1, 20]])
@@ -279,14 +279,14 @@ def test_invalid_stored_pairs_are_refused_later_ones_learnt(spoilt) -> None:
     fed.settle()
     assert fed.learnt == (20 - len(spoilt), 20 if 20 not in spoilt else 19)
     assert fed.learning.counters.refused == len(spoilt)
-    assert f"pair {spoilt[-1]} is not a PairMessage" in fed.feed.refused
+    assert f"sample {spoilt[-1]} is not a PairMessage" in fed.feed.refused
 
 
 def test_refused_history_is_reported_until_granted() -> None:
     fed = Fed(stored=10)
     fed.history.refusal = "the store is damaged"
     fed.feed.step(0.0)
-    assert fed.feed.problem == "the sampler does not give the pairs from 1 on: the store is damaged"
+    assert fed.feed.problem == "the sampler does not give the samples from 1 on: the store is damaged"
     fed.history.refusal = None
     fed.settle()
     assert (fed.learnt, fed.feed.problem) == ((10, 10), None)

@@ -105,7 +105,7 @@ def test_learner_far_behind_reports_its_backlog(learner: tuple[Learner, Wire]) -
     wire.handlers[KEYS.pair](encode(pair_to_wire(late)).replace(b"12:00:00.000", b"12:05:00.000"))
     status = wire.status()
     assert (status.behind, status.age_s) == (3995, 300.0)
-    assert "3995 stored pairs are not learnt yet, and the newest that was learnt is 300 s old" in status.health[0]
+    assert "3995 stored samples are not learnt yet, and the newest that was learnt is 300 s old" in status.health[0]
     assert decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply).age_s == 300.0
 
 

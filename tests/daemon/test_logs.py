@@ -84,7 +84,7 @@ def test_intermittently_full_disk_does_not_flood_log() -> None:
     for _ in range(100):
         writer.append(1, np.zeros(2), cast(MarkerFix, None))
     lines = [line.split(": ", 1)[1] for line in stream.getvalue().splitlines()]
-    assert lines == ["the disk is full; it is tried again with each pair", "the disk takes pairs again"]
+    assert lines == ["the disk is full; it is tried again with each sample", "the disk takes samples again"]
     logging.getLogger(reconnect.__name__).handlers[0].close()
     assert "49 more times" in stream.getvalue()
 
@@ -160,11 +160,11 @@ def test_message_is_logged_again_after_a_minute() -> None:
 def test_flood_differing_only_in_numbers_is_cut_off() -> None:
     journal = Journal()
     for number in range(500):
-        journal.say(f"pair {number} was refused")
+        journal.say(f"sample {number} was refused")
     journal.handler.close()
-    assert journal.lines[:2] == ["<4>bus: pair 0 was refused", "<4>bus: pair 1 was refused"]
+    assert journal.lines[:2] == ["<4>bus: sample 0 was refused", "<4>bus: sample 1 was refused"]
     assert len(journal.lines) == logs.RepeatSettings.often + 1
-    assert journal.lines[-1] == f"<4>bus: {500 - logs.RepeatSettings.often} more times in 0 s: pair # was refused"
+    assert journal.lines[-1] == f"<4>bus: {500 - logs.RepeatSettings.often} more times in 0 s: sample # was refused"
 
 
 def test_same_warning_for_two_joints_names_both() -> None:

@@ -241,7 +241,7 @@ def test_pairs_lost_to_full_disk_are_reported_unpublished(config, mount_small_di
     assert lost == 3000 - len(published)
     assert status.health[0] == (
         f"the disk of {file} is full. Free some space, or give a --state-dir on another disk. Nothing was changed. "
-        f"No pairs are taken until the disk does ({lost} frames so far)"
+        f"No samples are taken until the disk does ({lost} frames so far)"
     )
 
 

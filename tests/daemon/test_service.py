@@ -114,9 +114,9 @@ def test_reload_notifies_start_time_and_ready(service, systemd) -> None:
 
 
 def test_status_is_one_line_sent_on_change(service, systemd) -> None:
-    for line in ("running, 2 pairs", "running, 2 pairs", "the disk\nis full"):
+    for line in ("running, 2 samples", "running, 2 samples", "the disk\nis full"):
         service.report_status(line)
-    assert systemd.all() == ["STATUS=running, 2 pairs", "STATUS=the disk is full"]
+    assert systemd.all() == ["STATUS=running, 2 samples", "STATUS=the disk is full"]
 
 
 def test_status_shows_first_of_several_problems() -> None:

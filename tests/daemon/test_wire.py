@@ -111,17 +111,17 @@ def test_invalid_pair_message_is_refused_with_its_field(changed, said) -> None:
 
 
 def test_pair_with_wrong_joint_count_is_refused() -> None:
-    with pytest.raises(RequestError, match="pair 1 has 3 joint angles, this robot has 7"):
+    with pytest.raises(RequestError, match="sample 1 has 3 joint angles, this robot has 7"):
         pair_from_wire(decode(message(), PairMessage), 7)
 
 
 def test_a_pair_with_an_infinite_number_is_refused() -> None:
-    with pytest.raises(RequestError, match="pair 1 has a number that is not finite"):
+    with pytest.raises(RequestError, match="sample 1 has a number that is not finite"):
         pair_from_wire(PairMessage("id", 1, 1, 0.0, "", [0, 0, float("inf")], (0, 0, 0), (0,) * 6), 3)
 
 
 def test_pair_with_unnormalised_quaternion_is_refused() -> None:
-    with pytest.raises(RequestError, match="pair 1 has an R of the length 2, not 1"):
+    with pytest.raises(RequestError, match="sample 1 has an R of the length 2, not 1"):
         pair_from_wire(decode(message(R=[0, 0, 0, 2]), PairMessage), 3)
 
 

@@ -80,7 +80,7 @@ def test_the_page_has_every_reason() -> None:
 def test_the_page_s_limits_are_the_code_s() -> None:
     limits = section("Limits")
     assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
-    assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
+    assert f"| samples in a reply | {history.LARGEST_REPLY} |" in limits
     assert f"| points of the learning curve | {MAX_CURVE_POINTS} |" in limits
     assert f"| within {PairLimits.farthest_m:.0f} m, else" in limits
 
@@ -115,7 +115,7 @@ def run_example(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_example_prints_the_learner_s_prediction(learner: Config) -> None:
     done = run_example("ask_predictions.py", "arm", learner.tables.zenoh.learner, "0.0", "0.0")
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.match(r"x = \[0\.3, .*\] m, 1-sigma \[.*\] m, away from all data\nmodel \w+ of 0 pairs", done.stdout)
+    assert re.match(r"x = \[0\.3, .*\] m, 1-sigma \[.*\] m, away from all data\nmodel \w+ of 0 samples", done.stdout)
 
 
 def test_example_exits_with_the_learner_s_error(learner: Config) -> None:

@@ -98,7 +98,7 @@ def test_missing_diagnosis_input_is_shown_on_page(config, said, diagnoses) -> No
     diagnoses(lambda: stored(config, 3)).start()
     assert said.over.wait(LIMIT_S)
     assert said.newest.state == "failed"
-    assert "3 pairs are too few" in said.newest.said
+    assert "3 samples are too few" in said.newest.said
 
 
 def gone():

@@ -47,7 +47,7 @@ class Processes:
 
     def command(self, process: str, name: str) -> str:
         self._note(process, name)
-        return "no pairs are accepted until resume"
+        return "no samples are accepted until resume"
 
     def start(self) -> int:
         self._note("start")
@@ -93,7 +93,7 @@ def ask(hub: Hub, processes: Processes):
 
 def test_button_command_reaches_process_and_returns_answer(ask, processes) -> None:
     answer = ask("POST", "/api/command", json=PAUSE)
-    assert (answer.status_code, answer.json()["message"]) == (200, "no pairs are accepted until resume")
+    assert (answer.status_code, answer.json()["message"]) == (200, "no samples are accepted until resume")
     assert processes.told == [("sampler", "pause")]
 
 

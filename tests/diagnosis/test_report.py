@@ -25,7 +25,7 @@ from bodyschema.diagnosis.report.text import remedies
 from bodyschema.effects import EFFECT_TYPES, Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
-ABOUT = About("<pairs> & more.csv", "desk", "1.2.3")
+ABOUT = About("<samples> & more.csv", "desk", "1.2.3")
 VOID = {"meta", "br", "rect", "path", "line", "polyline", "polygon", "circle"}
 # May be left open in HTML.
 OPTIONAL = {"p", "li", "tr", "td", "th", "thead", "tbody"}
@@ -125,7 +125,7 @@ def test_jump_time_is_marked_in_time_plots(html) -> None:
 
 def test_names_from_outside_are_text(html) -> None:
     assert "<pairs>" not in html
-    assert "&lt;pairs&gt; &amp; more.csv" in html
+    assert "&lt;samples&gt; &amp; more.csv" in html
 
 
 def test_report_states_version_and_seed(html) -> None:

@@ -32,16 +32,16 @@ def test_first_map_is_exact_on_full_circle(capsys) -> None:
 
 def test_the_online_learner_gets_below_the_noise(capsys) -> None:
     errors = main_of(2)
-    assert list(errors) == ["drawing", "10 pairs", "100 pairs", "1000 pairs", "20 replays"]
+    assert list(errors) == ["drawing", "10 samples", "100 samples", "1000 samples", "20 replays"]
     assert sorted(errors.values(), reverse=True) == list(errors.values())
-    assert errors["20 replays"] < 10.0 < errors["100 pairs"]
+    assert errors["20 replays"] < 10.0 < errors["100 samples"]
     assert "20 replays:" in capsys.readouterr().out
 
 
 def test_new_tool_reaches_noise_after_thirty_pairs(capsys) -> None:
     errors = main_of(3)
-    assert errors["second tool, no pair of it"] > 150.0
-    assert errors["second tool, 30 pairs"] < 5.0 < errors["drawing"]
+    assert errors["second tool, no sample of it"] > 150.0
+    assert errors["second tool, 30 samples"] < 5.0 < errors["drawing"]
     assert len(capsys.readouterr().out.splitlines()) == len(errors)
 
 

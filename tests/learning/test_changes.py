@@ -43,20 +43,20 @@ def test_change_is_logged_once_detected_and_once_named(changes: Changes, caplog)
     for record in (None, UNDECIDED, UNDECIDED, NAMED, NAMED):
         changes.note(record)
     assert logged(caplog) == [
-        "change found at pair 201 (199 to 202, noticed at 210): undecided, marker moved by 12.1 mm",
-        "the change at pair 201 is joint shoulder",
+        "change found at sample 201 (199 to 202, noticed at 210): undecided, marker moved by 12.1 mm",
+        "the change at sample 201 is joint shoulder",
     ]
 
 
 def test_announced_change_is_logged_as_announced(changes: Changes, caplog) -> None:
     changes.note(ChangeRecord.reported(20))
-    assert logged(caplog) == ["tool changed before pair 21, as reported by the command tool_changed"]
+    assert logged(caplog) == ["tool changed before sample 21, as reported by the command tool_changed"]
 
 
 def test_a_rollback_is_logged(changes: Changes, caplog) -> None:
     changes.note(UNDECIDED)
     changes.note(None, rolled_back=True)
-    assert logged(caplog)[-1] == "rolled back to the model before pair 201"
+    assert logged(caplog)[-1] == "rolled back to the model before sample 201"
 
 
 def test_change_logged_before_restart_is_not_logged_again(caplog) -> None:

@@ -73,9 +73,9 @@ def test_duplicate_pair_is_refused_and_changes_nothing() -> None:
 @pytest.mark.parametrize(
     ("pair", "said"),
     [
-        (make_pair(11, np.full(JOINTS, np.nan), np.zeros(3)), "pair 11 has a number that is not finite"),
-        (make_pair(11, np.zeros(JOINTS), np.array([0.0, np.inf, 0.0])), "pair 11 has a number that is not finite"),
-        (make_pair(11, np.zeros(JOINTS - 1), np.zeros(3)), "pair 11 has 3 joint angles, this robot has 4"),
+        (make_pair(11, np.full(JOINTS, np.nan), np.zeros(3)), "sample 11 has a number that is not finite"),
+        (make_pair(11, np.zeros(JOINTS), np.array([0.0, np.inf, 0.0])), "sample 11 has a number that is not finite"),
+        (make_pair(11, np.zeros(JOINTS - 1), np.zeros(3)), "sample 11 has 3 joint angles, this robot has 4"),
         (make_pair(11, np.zeros(JOINTS), np.zeros(3), store="two"), "comes from the store two"),
         (make_pair(11, np.zeros(JOINTS), np.array([0.0, 0.0, 1500.0])), "positions are in metres"),
     ],
@@ -313,7 +313,7 @@ def test_learner_waiting_for_first_alignment_is_at_rest() -> None:
 def test_first_fit_in_progress_is_reported_as_unfinished() -> None:
     learning = new_learning(nominal_model(pose_known=False))
     teach(learning, Scene.draw(0, 60).pairs, background=False)
-    with pytest.raises(NoFrameError, match="the first fit of the 60 pairs so far is not finished"):
+    with pytest.raises(NoFrameError, match="the first fit of the 60 samples so far is not finished"):
         learning.snapshot.predict(np.zeros((1, 4)))
 
 

@@ -102,7 +102,7 @@ def test_one_changed_value_costs_one_pair(file, column, seq) -> None:
         assert numbers(reader) == [k for k in range(1, PAIRS + 1) if k != seq]
         assert reader.audit().damage == Damage(((seq, seq),))
     with PairStore(file, SESSION) as store:
-        assert f"1 pair of {file} cannot be read" in store.complaints[0]
+        assert f"1 sample of {file} cannot be read" in store.complaints[0]
         assert f"It is left out (number {seq})." in store.complaints[0]
         add(store, 1)
         assert numbers(store)[-1] == PAIRS + 1
@@ -119,7 +119,7 @@ def test_an_unreadable_row_is_left_out(file, damage) -> None:
 def test_missing_numbers_are_reported_and_skipped(file) -> None:
     alter(file, "DELETE FROM pairs WHERE seq BETWEEN 5 AND 6")
     with PairStore(file, SESSION) as store:
-        assert "2 pairs of" in store.complaints[0]
+        assert "2 samples of" in store.complaints[0]
         assert "(numbers 5 to 6)" in store.complaints[0]
 
 
@@ -196,7 +196,7 @@ def test_a_lost_page_costs_its_own_pairs(long) -> None:
     kept = long.with_name("pairs.sqlite.damaged-1")
     assert f"{long} was damaged" in rebuilt
     assert f"kept as {kept}" in rebuilt
-    assert f"{LONG - len(readable)} pairs of {long} cannot be read" in left_out
+    assert f"{LONG - len(readable)} samples of {long} cannot be read" in left_out
     assert kept.read_bytes()[100:] == damaged[100:]  # its header has another journal mode
     with PairStore(long, SESSION) as store:
         assert store.complaints == [left_out]
@@ -232,7 +232,7 @@ def test_several_lost_pages_cost_their_own_pairs(long) -> None:
 
 def test_a_lost_identity_costs_no_pair(file) -> None:
     alter(file, "UPDATE meta SET value = replace(value, '-', '+') WHERE key = 'store'")
-    with pytest.raises(StoreError, match="Start the sampler: it puts the pairs"), PairReader(file):
+    with pytest.raises(StoreError, match="Start the sampler: it puts the samples"), PairReader(file):
         pass
     with PairStore(file, SESSION) as store:
         assert numbers(store) == list(range(1, PAIRS + 1))
@@ -386,7 +386,7 @@ HOSTILE = {
     "a computed column": ("ALTER TABLE pairs ADD COLUMN y AS (q || q)",),
     "a further column": ("ALTER TABLE pairs ADD COLUMN y TEXT",),
     "a virtual table": ("DROP TABLE pairs", "CREATE VIRTUAL TABLE pairs USING fts4(seq, q, x)"),
-    "no pairs": ("DROP TABLE pairs",),
+    "no samples": ("DROP TABLE pairs",),
     "no meta": ("DROP TABLE meta",),
     "no joints": ("DELETE FROM meta WHERE key = 'joints'",),
     "joints that are numbers": ("UPDATE meta SET value = '[1,2]' WHERE key = 'joints'",),

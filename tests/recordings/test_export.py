@@ -126,7 +126,7 @@ def test_open_store_is_exported_without_robot_toml(tmp_path: Path, store: PairSt
     assert recording.q.tolist() == [[0.1, 0.2]]
     assert recording.centres_px is not None
     assert recording.centres_px.tolist() == [[1, 2, 3, 4]]
-    assert "1 pairs" in capsys.readouterr().out
+    assert "1 samples" in capsys.readouterr().out
 
 
 def test_json_has_the_number_of_pairs(tmp_path: Path, store: PairStore, capsys) -> None:
@@ -146,12 +146,12 @@ def test_export_reports_unreadable_pairs(tmp_path: Path, store: PairStore, caplo
         connection.commit()
     export(store.file, tmp_path / "a.csv")
     assert len(Recording.read(tmp_path / "a.csv", JOINTS)) == 2
-    assert f"2 pairs of {store.file} cannot be read" in caplog.text
+    assert f"2 samples of {store.file} cannot be read" in caplog.text
     assert "(numbers 2, 4)" in caplog.text
 
 
 def test_empty_store_export_is_rejected(tmp_path: Path, store: PairStore) -> None:
-    with pytest.raises(RecordingError, match="the store has no pairs"):
+    with pytest.raises(RecordingError, match="the store has no samples"):
         export(tmp_path / "pairs.sqlite", tmp_path / "a.csv")
 
 

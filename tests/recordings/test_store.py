@@ -265,7 +265,7 @@ def alter(file: Path, statement: str) -> None:
 def test_a_file_that_is_no_database_is_refused(file) -> None:
     file.parent.mkdir()
     file.write_text("my diary, 2026 " * 100)
-    assert "is not a pair store. Move it away" in refused(file)
+    assert "is not a sample store. Move it away" in refused(file)
 
 
 def test_another_programs_database_is_refused(file) -> None:
@@ -282,7 +282,7 @@ def test_a_store_of_a_newer_version_is_refused(closed) -> None:
 def test_another_robots_store_is_refused(closed) -> None:
     with contextlib.closing(store_schema.connect(closed)) as connection:
         store_schema.write_meta(connection, {**store_schema.meta(connection), "joints": '["hip","knee"]'})
-    assert "holds pairs of the joints hip, knee; robot.toml has waist, shoulder" in refused(closed)
+    assert "holds samples of the joints hip, knee; robot.toml has waist, shoulder" in refused(closed)
 
 
 def test_a_state_dir_below_a_file_is_refused(tmp_path) -> None:

@@ -55,7 +55,7 @@ def main(endpoint: str, pairs: str) -> None:
     until = time.monotonic() + LIMIT_S
     while asked(viewer, KEYS.status("learner")).get("pairs") != int(pairs):
         if time.monotonic() > until:
-            raise BusError("the pairs have not come")
+            raise BusError("the samples have not come")
         time.sleep(0.2)
     answers = {
         "predict": asked(viewer, KEYS.predict, q=[0.3, 0.1]),

@@ -74,7 +74,7 @@ def test_both_processes_report_unwritable_disk_and_continue(tmp_path, free_endpo
         learner_with(config, SOME)
         for number, said in ((errno.ENOSPC, "is full"), (errno.EIO, "disk I/O error")):
             disk.refuse(number)
-            text = health(config, "sampler", SamplerStatus, "No pairs are taken until the disk does")
+            text = health(config, "sampler", SamplerStatus, "No samples are taken until the disk does")
             assert said in text
             assert str(config.store_file) in text
             refuses_a_checkpoint(config)
@@ -95,7 +95,7 @@ def test_freed_disk_resumes_without_gap(tmp_path, free_endpoint, mount_small_dis
     with running(config, "sampler"), running(config, "learner"):
         learner_with(config, SOME)
         fill(ballast)
-        assert "is full" in health(config, "sampler", SamplerStatus, "No pairs are taken")
+        assert "is full" in health(config, "sampler", SamplerStatus, "No samples are taken")
         stopped = sampler_with(config, 0).pairs
         ballast.unlink()
         sampler_with(config, stopped + MORE)
@@ -111,7 +111,7 @@ def test_slow_disk_is_reported_and_loses_nothing(tmp_path, free_endpoint, disk_s
     with running(config, "sampler", environment=disk.environment), running(config, "learner"):
         learner_with(config, SOME)
         disk.slow(150)
-        assert str(config.store_file) in health(config, "sampler", SamplerStatus, "is slow: a pair took")
+        assert str(config.store_file) in health(config, "sampler", SamplerStatus, "is slow: a sample took")
         answer(config, "learner", KEYS.predict, b'{"q": [0.1, 0.2]}')
         disk.slow(0)
         expect_each_pair_learnt_once(config)
@@ -196,7 +196,7 @@ def test_file_size_limit_is_reported(tmp_path, free_endpoint) -> None:
     if not any(os.access(f"{folder}/prlimit", os.X_OK) for folder in os.environ["PATH"].split(":")):
         pytest.skip("no prlimit; to run it: apt-get install util-linux")
     with running(config, "sampler", prefix=limited):
-        text = health(config, "sampler", SamplerStatus, "No pairs are taken until the disk does")
+        text = health(config, "sampler", SamplerStatus, "No samples are taken until the disk does")
         stopped = sampler_with(config, 0).pairs
     assert str(config.store_file) in text
     with PairReader(config.store_file) as store:

@@ -156,4 +156,4 @@ def predicted(type_: Callable[..., str], robot: tuple[object, ...]) -> list[floa
             continue
         if reply["pairs"] >= 60:
             return reply["x"][0]
-    raise AssertionError("too few pairs")
+    raise AssertionError("too few samples")

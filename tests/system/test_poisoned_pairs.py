@@ -85,7 +85,7 @@ def test_impossible_stored_pair_is_refused(config) -> None:
         status = learner_with(config, PAIRS)
         expect_numbers(config, PAIRS - 1)
     assert (status.pairs, status.refused) == (PAIRS - 1, 1)
-    assert any(f"pair {SPOILT} says that it may be 1e+150 m wrong" in text for text in status.health)
+    assert any(f"sample {SPOILT} says that it may be 1e+150 m wrong" in text for text in status.health)
 
 
 def test_malformed_stored_row_is_skipped(config) -> None:

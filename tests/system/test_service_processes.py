@@ -157,7 +157,7 @@ def test_learner_is_ready_when_it_answers(config: Config, systemd: Systemd) -> N
         systemd.wait_for("READY=1")
         with client(config.tables.zenoh.learner) as bus:
             assert decode(bus.ask_one(KEYS.status("learner")), LearnerStatus).state == "waiting"
-        assert "STATUS=waiting, 0 pairs, prior answers. no sampler on" in systemd.wait_for("STATUS=waiting")
+        assert "STATUS=waiting, 0 samples, prior answers. no sampler on" in systemd.wait_for("STATUS=waiting")
         child.terminate()
         systemd.wait_for("STOPPING=1")
         assert child.wait(LIMIT_S) == 0

@@ -98,7 +98,7 @@ def started(machine: Machine, robot: Path) -> None:
 
 def pairs(machine: Machine, unit: str) -> int:
     """Return the number of pairs that a unit reports."""
-    found = re.search(r"(\d+) pairs", machine.show(unit, "StatusText"))
+    found = re.search(r"(\d+) samples", machine.show(unit, "StatusText"))
     return 0 if found is None else int(found[1])
 
 

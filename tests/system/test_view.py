@@ -191,10 +191,10 @@ def test_every_panel_shows_what_runs(page) -> None:
     says(page, "#tile-error", r"[\d.]+ mm")
     says(page, "#tile-predict", r"[\d.]+ ms")
     says(page, "#outlook", "(Enough data|More data)")
-    says(page, "#arm-text", r"Pair \d+: prediction and measurement are [\d.]+ mm apart")
+    says(page, "#arm-text", r"Sample \d+: prediction and measurement are [\d.]+ mm apart")
     says(page, "#calibration", "camera yaw")
-    says(page, "#cloud-text", r"[\d,]+ pairs with this tool, all learnt already: median [\d.]+ mm")
-    says(page, "#error-text", r"[\d.]+ mm after [\d,]+ pairs")
+    says(page, "#cloud-text", r"[\d,]+ samples with this tool, all learnt already: median [\d.]+ mm")
+    says(page, "#error-text", r"[\d.]+ mm after [\d,]+ samples")
     says(page, "#latency-text", r"Median [\d.]+ ms")
     expect(page.locator("#error-plot canvas")).to_be_visible()
     expect(page.locator("#coverage li")).to_have_count(7)
@@ -206,7 +206,7 @@ def test_every_panel_shows_what_runs(page) -> None:
 def test_pause_and_resume_are_one_button(page) -> None:
     page.click("#pause")
     says(page, "#pill-sampler", "paused")
-    says(page, "#notices", "no pairs are accepted until resume")
+    says(page, "#notices", "no samples are accepted until resume")
     expect(page.locator("#pause")).to_have_text("Resume")
     says(page, "#rejected", "paused")
     page.click("#pause")
@@ -231,7 +231,7 @@ def test_tool_change_is_confirmed_and_marked(page) -> None:
 
 def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
     page.click("#diagnose")
-    says(page, "#diagnosis", r"Diagnosis of the newest [\d,]+ pairs")
+    says(page, "#diagnosis", r"Diagnosis of the newest [\d,]+ samples")
     expect(page.locator("#diagnose")).to_be_disabled()
     page.click("#diagnosis-stop")
     says(page, "#diagnosis", "The diagnosis was stopped")

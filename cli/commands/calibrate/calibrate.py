@@ -81,7 +81,7 @@ class FitOptions:
     def fitted(
         self, robot: RobotDescription, recording: Recording, common: CommonErrors | None
     ) -> tuple[Calibration, Calibration | None]:
-        """Return the calibration, and one with everything free if the URDF is trusted and the pairs suffice.
+        """Return the calibration, and one with everything free if the URDF is trusted and the samples suffice.
 
         Args:
             common: returns the errors that all positions share, as for `Calibration.of`; None if none are known.
@@ -158,7 +158,7 @@ def arm(
     source: Annotated[
         Path | None,
         Parameter(
-            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); else the "
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a sample store (.sqlite); else the "
             "robot's own store."
         ),
     ] = None,
@@ -178,27 +178,27 @@ def arm(
     force: Annotated[
         bool,
         flag(
-            "Go on, and write, although the pairs do not seem to be of this robot, or its zeros are far off; replace "
+            "Go on, and write, although the samples do not seem to be of this robot, or its zeros are far off; replace "
             "files in OUT."
         ),
     ] = False,
 ) -> None:
     """Calibrate camera, tool and joint offsets, with 95 % intervals; writes a calibrated URDF.
 
-    Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
-    tool: from a store, only the pairs since the learner's last tool change are used. If residuals jump as with another
-    tool, the row is reported, and nothing is written.
+    Learns a rigid chain from all samples, around the nominal one. Outliers are left out. All samples have to be of one
+    tool: from a store, only the samples since the learner's last tool change are used. If residuals jump as with
+    another tool, the row is reported, and nothing is written.
 
-    Pairs are refused if their columns are exchanged, reversed, or have another zero or unit, or if they are of another
-    robot. Joint offsets larger than five times --zeros-deg, and links worse than those of any arm, are printed and not
-    written. --force overrules both.
+    Samples are refused if their columns are exchanged, reversed, or have another zero or unit, or if they are of
+    another robot. Joint offsets larger than five times --zeros-deg, and links worse than those of any arm, are
+    printed and not written. --force overrules both.
 
     The URDF opens in pybullet, Pinocchio and ROS. It has the camera and the marker as links, and its positions agree
     with the learnt chain's to rounding. Meshes, masses and limits stay.
 
     Needs: a recording or a store, and its robot.toml; no hardware. The daemon may be running: its store is read. Poses
-    that robot.toml declares unknown (`pose_known`, `marker_known`) are taken from the pairs alone, the rest is trusted
-    to 1° and 10 mm.
+    that robot.toml declares unknown (`pose_known`, `marker_known`) are taken from the samples alone, the rest is
+    trusted to 1° and 10 mm.
 
     Next: `bodyschema run --robot OUT/robot.toml` starts from the calibrated robot. With --lerobot the joint offsets go
     into the servos instead, by LeRobot's own calibration file.
@@ -323,7 +323,7 @@ def _written(config: Config, found: Calibration, report: CalibrationReport, out:
     from bodyschema.robot.calibrated_files import write_calibrated
     from bodyschema.robot.hand_eye import write_launch_file
 
-    heading = f"Calibrated by bodyschema from {report.pairs} pairs of {report.source}"
+    heading = f"Calibrated by bodyschema from {report.pairs} samples of {report.source}"
     written = write_calibrated(config.robot, found.figures.geometry, out, heading, replace=replace)
     launch = write_launch_file(report.hand_eye, out)
     return [

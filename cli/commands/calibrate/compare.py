@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def compare(
-    first: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite).")],
+    first: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a sample store (.sqlite).")],
     second: Annotated[Path, Parameter(help="Another, at the same joint angles.")],
     /,
     *,

@@ -33,12 +33,12 @@ def diagnose(
     recording: Annotated[
         Path | None,
         Parameter(
-            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a pair store (.sqlite); or --live."
+            help="A recording (.csv, .parquet), a ROS bag, a LeRobotDataset or a sample store (.sqlite); or --live."
         ),
     ] = None,
     /,
     *,
-    live: Annotated[bool, flag("Take the running sampler's pairs, in the place of a recording.")] = False,
+    live: Annotated[bool, flag("Take the running sampler's samples, in the place of a recording.")] = False,
     robot: SourceRobotFile = None,
     out: Annotated[
         Path | None,
@@ -48,7 +48,7 @@ def diagnose(
     taken: SourceOptions = AS_THEY_ARE,
     servos: LeRobotOptions = WITHOUT_LEROBOT,
     as_json: Annotated[bool, flag("Print diagnosis.json.", name="--json")] = False,
-    force: Annotated[bool, flag("Go on although the pairs do not seem to be of this robot.")] = False,
+    force: Annotated[bool, flag("Go on although the samples do not seem to be of this robot.")] = False,
 ) -> None:
     """Find what the simulation gets wrong in a recording, why, and how much correcting it helps.
 
@@ -56,7 +56,7 @@ def diagnose(
     is one of these: causes with their numbers and probabilities; nothing is wrong; this recording cannot decide; or no
     known effect explains the error. The exit code is 0 for all of them.
 
-    Without --out nothing is written. Pairs are refused if their columns are exchanged, reversed, or have another zero
+    Without --out nothing is written. Samples are refused if their columns are exchanged, reversed, or have another zero
     or unit, or if they are of another robot.
 
     Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.

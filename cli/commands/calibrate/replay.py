@@ -38,7 +38,7 @@ def replay(
     speed: Annotated[
         float | None,
         Parameter(
-            help="1 as recorded, 0 as fast as pairs are stored; else 30 rows/s or 20 s.", validator=Number(gte=0)
+            help="1 as recorded, 0 as fast as samples are stored; else 30 rows/s or 20 s.", validator=Number(gte=0)
         ),
     ] = None,
     sigma_mm: Annotated[
@@ -146,7 +146,7 @@ def _line(sampler: SamplerStatus, learner: LearnerStatus) -> str:
 
     error = learner.prequential_m.get(learner.answering)
     return (
-        f"{sampler.frames} rows fed, {sampler.pairs} pairs accepted, {learner.pairs} learnt, "
+        f"{sampler.frames} rows fed, {sampler.pairs} samples accepted, {learner.pairs} learnt, "
         f"{learner.replayed} replayed, {learner.state} ({learner.answering}), "
-        f"error on new pairs {mm(error)}"
+        f"error on new samples {mm(error)}"
     )

@@ -39,7 +39,7 @@ def reproduce(
     """Rerun the experiments of Ulbrich et al. 2009, and compare the results with the paper's figures.
 
     The arm is the shipped upper body, simulated. Walks go through the sampler. The daemon's learner and other models
-    learn the same pairs as the paper's method. In figures 5 and 7 the marker is also measured: stereo images are
+    learn the same samples as the paper's method. In figures 5 and 7 the marker is also measured: stereo images are
     rendered and tracked, and encoders are read in ticks.
 
     Time on two idle cores: fig4 half a minute, fig5 and fig7 about a minute and a half each, fig6 one minute, exactness

@@ -16,7 +16,9 @@ from bodyschema.interfaces.errors import RequestError
 
 def simulate(
     *,
-    like: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite): the joint angles.")],
+    like: Annotated[
+        Path, Parameter(help="A recording (.csv, .parquet) or a sample store (.sqlite): the joint angles.")
+    ],
     robot: SourceRobotFile = None,
     out: Annotated[
         Path | None, Parameter(help="The file (.csv, .parquet, .mcap, .rrd); else CSV goes to standard output.")

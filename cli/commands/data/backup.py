@@ -31,13 +31,13 @@ def backup(
     force: Annotated[bool, flag("Replace FILE if it is there; with --restore, move what is in the way aside.")] = False,
     as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
-    """Copy pairs, checkpoint, robot.toml and the files that it names into one file, or restore such a file.
+    """Copy samples, checkpoint, robot.toml and the files that it names into one file, or restore such a file.
 
     A backup can be written while sampler and learner run. It is a ZIP archive with a checksum of every file, and only
     you can read it: robot.toml may hold passwords.
 
     --restore verifies the whole file before anything changes; existing files are kept. The store gets a new identity,
-    so that no learner mixes its new pairs with those that came after the backup.
+    so that no learner mixes its new samples with those that came after the backup.
 
     Needs: a store (`bodyschema run` creates it); with --restore, sampler and learner stopped.
 
@@ -66,10 +66,10 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_j
         return
     learnt = "" if any(name.endswith(".ckpt") for name in made.files) else ", no checkpoint yet"
     size = file.stat().st_size / 1e6
-    say(f"{file}: {made.robot}, {made.pairs} pairs to number {made.last_seq}{learnt}, {size:.1f} MB")
+    say(f"{file}: {made.robot}, {made.pairs} samples to number {made.last_seq}{learnt}, {size:.1f} MB")
     if made.unreadable:
         say(
-            f"{made.unreadable} pairs cannot be read and are not in it: the disk changed what was written. Check the "
+            f"{made.unreadable} samples cannot be read and are not in it: the disk changed what was written. Check the "
             "disk; `bodyschema doctor` lists their numbers"
         )
 
@@ -85,9 +85,9 @@ def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as
         aside = {"aside": list(map(str, done.aside)), "elsewhere": {str(a): str(b) for a, b in done.elsewhere.items()}}
         print_json({"robot": made.robot, "pairs": made.pairs, "written": list(map(str, done.written)), **aside})
         return
-    say(f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}")
+    say(f"{made.robot} as it was at {made.written_utc}: {made.pairs} samples to number {made.last_seq}")
     if done.unreadable:
-        say(f"  {done.unreadable} pairs between could not be read when it was written")
+        say(f"  {done.unreadable} samples between could not be read when it was written")
     say(*(f"  {written}" for written in done.written))
     say(*(f"  what was there before is {aside}" for aside in done.aside))
     say(
@@ -97,6 +97,6 @@ def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as
         )
     )
     say(
-        "A learner on another machine takes the pairs as those of another store: send it `bodyschema command "
+        "A learner on another machine takes the samples as those of another store: send it `bodyschema command "
         "reset_to_prior`."
     )

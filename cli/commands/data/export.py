@@ -27,14 +27,14 @@ def export(
     source: Annotated[
         Path,
         Parameter(
-            help="A pair store (.sqlite), a recording (.csv, .parquet), a ROS bag, a LeRobotDataset, or a robot "
+            help="A sample store (.sqlite), a recording (.csv, .parquet), a ROS bag, a LeRobotDataset, or a robot "
             "(extended.toml)."
         ),
     ],
     out: Annotated[
         Path,
         Parameter(
-            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for pairs, .xml (MJCF), .urdf, "
+            help="The file; its ending says the format: .csv, .parquet, .mcap, .rrd for samples, .xml (MJCF), .urdf, "
             ".json (run-time correction) or .txt (settings of drivers) for a robot."
         ),
     ],
@@ -49,7 +49,7 @@ def export(
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
     as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
-    """Turn pairs into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
+    """Turn samples into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
 
     A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
     under `/marker`, and the devices of the joints (servos, firmware, homing offsets) as metadata. .rrd opens in Rerun:
@@ -85,7 +85,7 @@ def export(
     if as_json:
         print_json({"file": str(out), "pairs": len(recording)})
     else:
-        say(f"{len(recording)} pairs written to {out}")
+        say(f"{len(recording)} samples written to {out}")
 
 
 def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool, as_json: bool) -> None:

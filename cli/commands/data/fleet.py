@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def fleet(
-    *recordings: Annotated[Path, Parameter(help="Recordings (.csv, .parquet) or pair stores (.sqlite) to diagnose.")],
+    *recordings: Annotated[Path, Parameter(help="Recordings (.csv, .parquet) or sample stores (.sqlite) to diagnose.")],
     folder: Annotated[
         Path | None, Parameter(name="--from", help="Diagnose all recordings in this folder and those in it.")
     ] = None,
@@ -55,7 +55,7 @@ def fleet(
 ) -> None:
     """List all running robots; compare them; or diagnose many recordings in parallel.
 
-    Without recordings, robots are found by their liveliness tokens: pairs, rate, error, answering model, health. With
+    Without recordings, robots are found by their liveliness tokens: samples, rate, error, answering model, health. With
     --watch --json, prints one line about every second. Exit code 1 if no robot is found.
 
     --compare finds the unit that differs, and in which figures. Robots are of one type if their joints have the same

@@ -18,13 +18,13 @@ def record(
     *,
     robot: RobotFile = HERE,
     from_seq: Annotated[
-        int, Parameter(name="--from", help="Sequence number of the first pair.", validator=Number(gte=1))
+        int, Parameter(name="--from", help="Sequence number of the first sample.", validator=Number(gte=1))
     ] = 1,
-    follow: Annotated[bool, flag("Go on with the pairs to come, until Ctrl-C.")] = False,
+    follow: Annotated[bool, flag("Go on with the samples to come, until Ctrl-C.")] = False,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
     as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
-    """Copy the running sampler's pairs into a file.
+    """Copy the running sampler's samples into a file.
 
     For the store of a sampler that is not running, use `bodyschema export`.
 
@@ -45,7 +45,7 @@ def record(
             signals = SignalFlags()
             with on_termination(signals.end):
                 if not as_json:
-                    say(f"writing pairs to {out} as they come; Ctrl-C ends it")
+                    say(f"writing samples to {out} as they come; Ctrl-C ends it")
                 count = follow_history(history, config.robot, out, lambda: signals.ending)
         else:
             count = copy_history(history, config.robot, out)
@@ -55,11 +55,11 @@ def record(
         )
         return
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
-    say(f"{count} pairs written to {out}{last}")
+    say(f"{count} samples written to {out}{last}")
     if history.missing.count:
         one = history.missing.count == 1
         say(
-            f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
+            f"{history.missing.count} sample{'' if one else 's'} between them {'is' if one else 'are'} missing "
             f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
             "([daemon] keep_days, keep_mb); `bodyschema status` shows which"
         )

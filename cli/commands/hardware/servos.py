@@ -59,7 +59,7 @@ def servos(
 
     --zero prints the joint's present position as zero_ticks for robot.toml, and writes nothing. With --in-servo, the
     servo's homing offset is written instead, so that its present position becomes robot.toml's zero_ticks. Either way,
-    earlier pairs have another zero. Exit code 1 if something was not written.
+    earlier samples have another zero. Exit code 1 if something was not written.
 
     Needs: robot.toml with servos, or --port and --id; and no running sampler.
 

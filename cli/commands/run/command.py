@@ -26,12 +26,12 @@ def command(
 ) -> None:
     """Send a command to a running process.
 
-    `pause` and `resume` stop and restart accepting pairs (or, with --to learner, learning). `reload` reads robot.toml
+    `pause` and `resume` stop and restart accepting samples (or, with --to learner, learning). `reload` reads robot.toml
     again and lists the settings that need a restart. `zero_force_on` lets the servos hold the arm, `gaze_on` turns the
     head to the hand, and `..._off` switches their torque off. `accept_turns` is for a joint that lost its turn count
     while its bus was away, if it is at the position in the message: it assumes the turn nearest to its last position.
     `tool_changed` reports a tool change; `rollback` restores the model before the last change; `reset_to_prior`
-    discards the learnt model, but not the stored pairs; `checkpoint` writes the learner's state now.
+    discards the learnt model, but not the stored samples; `checkpoint` writes the learner's state now.
 
     Needs: that process running (`bodyschema run`).
 

@@ -80,5 +80,5 @@ def _show(reply: IkReply, config: ClientConfig, deg: bool) -> None:
     spread = ", ".join(two_digits(1e3 * value) for value in reply.sigma)
     where = "where data was" if reply.in_support else "away from all data"
     console.print(
-        f"1-sigma of x, y, z there {spread} mm, {where}; model {reply.model}, {reply.pairs} pairs", style="dim"
+        f"1-sigma of x, y, z there {spread} mm, {where}; model {reply.model}, {reply.pairs} samples", style="dim"
     )

@@ -40,7 +40,7 @@ def install(
     name: Annotated[str, Parameter(help="Name of the learner of several robots.")] = "fleet",
     yes: Annotated[bool, flag("Do not ask.")] = False,
     dry_run: Annotated[bool, flag("Show, and change nothing.")] = False,
-    uninstall: Annotated[bool, flag("Stop the services and remove them, or remove the rules; pairs stay.")] = False,
+    uninstall: Annotated[bool, flag("Stop the services and remove them, or remove the rules; samples stay.")] = False,
     root: Root = Path("/"),
 ) -> None:
     """Install systemd services or udev rules. Shows what it would write, and asks first.

@@ -137,4 +137,4 @@ def _show(reply: PredictReply) -> None:
     console = Console(highlight=False)
     console.print(table)
     age = "none since it started" if reply.age_s is None else f"the newest {reply.age_s:.1f} s old"
-    console.print(f"model {reply.model}, {reply.pairs} pairs learnt, {age}", style="dim")
+    console.print(f"model {reply.model}, {reply.pairs} samples learnt, {age}", style="dim")

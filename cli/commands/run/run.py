@@ -31,7 +31,9 @@ def run(
     sim: Annotated[bool, flag("The simulated robot in the place of the hardware.")] = False,
     state_dir: Annotated[
         Path | None,
-        Parameter(help="Where pairs and checkpoint live (a folder each for several robots); else as robot.toml says."),
+        Parameter(
+            help="Where samples and checkpoint live (a folder each for several robots); else as robot.toml says."
+        ),
     ] = None,
     view: Annotated[bool, flag("Show the page of `bodyschema view` too, as a process of its own.")] = False,
     exit_at_end: Annotated[bool, flag("Sampler: end when a recording is through.")] = False,
@@ -42,13 +44,13 @@ def run(
 ) -> None:
     """Start sampler and learner as separate processes, and restart one that dies. Ctrl-C ends both.
 
-    `bodyschema run sampler` turns encoder readings and camera frames into pairs, stores and publishes them. Each pair
-    is stored before it is published. While the store cannot be written (the disk is full), the status reports it and
-    no pairs are taken.
+    `bodyschema run sampler` turns encoder readings and camera frames into samples, stores and publishes them. Each
+    sample is stored before it is published. While the store cannot be written (the disk is full), the status reports
+    it and no samples are taken.
 
-    `bodyschema run learner` learns the kinematics and answers queries. New pairs come from the sampler, on this machine
-    or another; without one, the learner answers from the pairs so far. With several robots, each pair is learnt as it
-    arrives, and less urgent work is done in turns (docs/fleet.md).
+    `bodyschema run learner` learns the kinematics and answers queries. New samples come from the sampler, on this
+    machine or another; without one, the learner answers from the samples so far. With several robots, each sample is
+    learnt as it arrives, and less urgent work is done in turns (docs/fleet.md).
 
     Needs: robot.toml (`bodyschema init`) with joints and cameras, or a recording in its table [drivers]; with --sim,
     the arm alone (`bodyschema init --sim` writes an example).

@@ -21,8 +21,8 @@ WHAT = {
 def demo(
     *,
     out: Annotated[Path, Parameter(help="Folder for the recording, the curve and the plot.")] = OUT,
-    pairs: Annotated[int, Parameter(help="Pairs to learn before the tool change.", validator=Number(gte=1))] = 600,
-    pairs_after: Annotated[int, Parameter(help="Pairs to learn after it.", validator=Number(gte=1))] = 300,
+    pairs: Annotated[int, Parameter(help="Samples to learn before the tool change.", validator=Number(gte=1))] = 600,
+    pairs_after: Annotated[int, Parameter(help="Samples to learn after it.", validator=Number(gte=1))] = 300,
     seed: Annotated[int, Parameter(help="Another robot, another path, other noise.", validator=Number(gte=0))] = 0,
     bus: Annotated[
         Literal["dynamixel", "feetech", "serial", "ros2"] | None,

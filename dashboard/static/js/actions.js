@@ -49,7 +49,7 @@ export class Actions {
     this.state = state;
     const { sampler, learner, diagnosis } = state;
     const change = learner?.status?.last_change;
-    if (change) text("rollback-of", `The last change: ${changed({ kind: change.kind, told: !change.found })}, from pair ${change.first_seq} on. What was learnt since is dropped; the pairs stay stored.`);
+    if (change) text("rollback-of", `The last change: ${changed({ kind: change.kind, told: !change.found })}, from sample ${change.first_seq} on. What was learnt since is dropped; the samples stay stored.`);
     const running = ["copying", "running"].includes(diagnosis?.state);
     const can = { pause: sampler?.answers && ["running", "paused"].includes(sampler.status.state), tool: learner?.answers, rollback: learner?.answers && change?.can_roll_back, diagnose: sampler?.answers && !running };
     for (const [id, possible] of Object.entries(can)) byId(id).disabled = !(connected && possible);
@@ -62,9 +62,9 @@ export class Actions {
     byId("diagnosis-section").hidden = !diagnosis?.number;
     if (!diagnosis?.number) return;
     byId("diagnosis-stop").hidden = !running;
-    const of = diagnosis.pairs ? ` of the newest ${whole(diagnosis.pairs)} pairs` : "";
+    const of = diagnosis.pairs ? ` of the newest ${whole(diagnosis.pairs)} samples` : "";
     const said = {
-      copying: "Copying pairs from the sampler…",
+      copying: "Copying samples from the sampler…",
       running: `Diagnosis${of}: ${diagnosis.said}…`,
       done: `${VERDICTS[diagnosis.verdict] ?? ""} ${diagnosis.said} (Diagnosis${of}.)`,
       failed: `The diagnosis failed: ${diagnosis.said}`,

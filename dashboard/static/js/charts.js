@@ -103,7 +103,7 @@ export class ErrorChart {
   constructor() {
     this.changes = [];
     this.over = "pairs";
-    this.chart = new Chart("error-plot", (key) => this.options(key), "No pair was learnt yet");
+    this.chart = new Chart("error-plot", (key) => this.options(key), "No sample was learnt yet");
     for (const choice of document.getElementsByName("axis")) {
       choice.addEventListener("change", () => {
         this.over = choice.value;
@@ -126,20 +126,20 @@ export class ErrorChart {
     if (!curve.length) return;
     const [[first, begin], [pairs, error]] = [curve[0], curve.at(-1)];
     const told = this.changes.length ? `; ${this.changes.map((change) => `${changed(change)} after ${whole(change.pairs)}`).join(", ")}` : "";
-    text("error-text", `${mm(error)} after ${whole(pairs)} pairs, ${mm(begin)} after ${whole(first)}${told}.`);
+    text("error-text", `${mm(error)} after ${whole(pairs)} samples, ${mm(begin)} after ${whole(first)}${told}.`);
   }
 
   options(key) {
     const time = key === "time";
     const series = [
-      { label: time ? "time" : "pairs", value: (_, shown) => (shown === null ? "–" : time ? clock(shown) : whole(shown)) },
-      line("error on new pairs", "--line", mm),
+      { label: time ? "time" : "samples", value: (_, shown) => (shown === null ? "–" : time ? clock(shown) : whole(shown)) },
+      line("error on new samples", "--line", mm),
     ];
     if (time) series.push(line("expected error", "--second", mm, { dash: [6, 4] }));
     return {
       series,
       scales: { x: { time }, y: { distr: 3 } },
-      axes: [time ? { ...axis(undefined, times), space: 70 } : axis("pairs learnt"), { ...axis("mm", millimetres), size: 58 }],
+      axes: [time ? { ...axis(undefined, times), space: 70 } : axis("samples learnt"), { ...axis("mm", millimetres), size: 58 }],
       cursor: { drag: { x: true, y: false } },
       plugins: [marks(() => this.changes.map((change) => ({ at: time ? change.t : change.pairs, said: changed(change) })))],
     };

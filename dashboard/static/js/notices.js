@@ -3,7 +3,7 @@ import { byId, element } from "./dom.js";
 import { clock } from "./format.js";
 
 const MEANS = {
-  sampler: "No new pairs come.",
+  sampler: "No new samples come.",
   learner: "Predictions are not answered, and nothing is learnt.",
 };
 

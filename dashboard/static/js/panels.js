@@ -20,7 +20,7 @@ export function tiles({ sampler, learner, series }) {
   text("tile-model-label", status?.model ? `answers, version ${status.model.slice(0, 8)}` : "answers");
 }
 
-const lastPairs = (status) => `last ${whole(status.prequential_pairs)} pairs`;
+const lastPairs = (status) => `last ${whole(status.prequential_pairs)} samples`;
 
 export function pills({ sampler, learner }) {
   for (const [name, process] of [["sampler", sampler], ["learner", learner]]) {
@@ -39,7 +39,7 @@ export function outlook({ outlook: found }) {
   table.hidden = !found;
   if (!found) return;
   const differs = found.best_motion_m.some((error, k) => error !== found.like_so_far_m[k]);
-  table.tHead.replaceChildren(row(element("th", {}, ""), ...[`after ${whole(found.pairs)} pairs`, ...found.further_pairs.map((pairs) => `+${pairs} pairs`)].map((name) => element("th", { scope: "col" }, name))));
+  table.tHead.replaceChildren(row(element("th", {}, ""), ...[`after ${whole(found.pairs)} samples`, ...found.further_pairs.map((pairs) => `+${pairs} samples`)].map((name) => element("th", { scope: "col" }, name))));
   const rows = [row("as so far", mm(found.now_m), ...found.like_so_far_m.map(mm))];
   if (differs) {
     rows.push(row(found.best_motion, mm(found.now_m), ...found.best_motion_m.map(mm)));
@@ -52,13 +52,13 @@ export function arm({ arm: found }) {
   if (!found) return;
   const apart = found.apart_m === null ? "no model answers" : `prediction and measurement are ${mm(found.apart_m)} apart`;
   const sure = found.radii ? `; 95 % of measurements should lie in the ellipsoid around the prediction, at most ${mm(Math.max(...found.radii))} away` : "";
-  caption("arm", `Pair ${found.pair}: ${apart}${sure}.${found.placed ? "" : " The camera's pose is not known yet: the marker is drawn at robot.toml's guess."}`);
+  caption("arm", `Sample ${found.pair}: ${apart}${sure}.${found.placed ? "" : " The camera's pose is not known yet: the marker is drawn at robot.toml's guess."}`);
 }
 
 export function cloud({ cloud: found }) {
   const shown = found && found.x.length > 0;
   text("cloud-stretch", String(shown ? stretchOf(found) : 100));
-  caption("cloud", shown ? `${found.x.length} pairs with this tool, all learnt already: median ${mm(found.median_m)}, 95 % within ${mm(found.p95_m)}.` : "No residuals yet");
+  caption("cloud", shown ? `${found.x.length} samples with this tool, all learnt already: median ${mm(found.median_m)}, 95 % within ${mm(found.p95_m)}.` : "No residuals yet");
 }
 
 function caption(id, said) {
@@ -102,7 +102,7 @@ export function calibration({ learner, robot }) {
     else hidden.push(name);
   }
   const kept = hidden.length ? ` Kept at nominal, because no motion shows the offset: ${hidden.join(", ")}.` : "";
-  text("calibration-text", `Of ${whole(found.pairs)} pairs: camera in ${found.camera_link}, marker in ${found.marker_link}, joint offsets to add to readings.${kept}`);
+  text("calibration-text", `Of ${whole(found.pairs)} samples: camera in ${found.camera_link}, marker in ${found.marker_link}, joint offsets to add to readings.${kept}`);
   byId("calibration").tBodies[0].replaceChildren(...rows);
 }
 

@@ -25,7 +25,7 @@ class CameraLatency(Presenter):
         late = found.numbers["latency_s"]
         what = "Subtract" if late > 0.0 else "Add"
         where = "from" if late > 0.0 else "to"
-        return f"{what} {1e3 * abs(late):.3g} ms {where} the images' time stamps, or stop the arm for each pair."
+        return f"{what} {1e3 * abs(late):.3g} ms {where} the images' time stamps, or stop the arm for each sample."
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
         partial, own = attributed(residuals, effect)
