@@ -39,21 +39,21 @@ from bodyschema.diagnosis.search.held_out import (
     is_marker,
 )
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
-from bodyschema.diagnosis.search.scan import Candidate, Scan, refit_moment
-from bodyschema.diagnosis.search.search import Search, are_only_descriptive
-from bodyschema.diagnosis.search.together import (
+from bodyschema.diagnosis.search.joint_selection import (
     ToleranceEstimate,
     alternatives_to_tolerances,
     estimated_tolerances,
     together,
 )
+from bodyschema.diagnosis.search.scan import Candidate, Scan, refit_moment
+from bodyschema.diagnosis.search.search import Search, are_only_descriptive
 from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies
 from bodyschema.diagnosis.unnamed.rattle import LooseMarker, likelihood, rattle, rattle_with_refit
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
-from .stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
+from .progress import RIVALS, SEARCH, SETS, UNNAMED, Stages
 
 ReportProgress = Callable[[str], None]
 

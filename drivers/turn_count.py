@@ -9,7 +9,7 @@ from typing import Protocol
 
 from bodyschema.interfaces.errors import SourceLost
 
-from .turns import nearest_turn
+from .speed_gate import nearest_turn
 
 log = logging.getLogger(__name__)
 

@@ -31,7 +31,8 @@ from .counters import SamplerCounters
 from .gate import PairGate
 from .gaze_loop import gaze_of
 from .history import LARGEST_REPLY, answer_pairs
-from .reconnect import ReconnectingSource, ResilientWriter
+from .pair_writer import ResilientWriter
+from .reconnect import ReconnectingSource
 from .sources import ReportsHealth, Sources, answer_simulation, request_power
 
 log = logging.getLogger(__name__)

@@ -26,8 +26,8 @@ class RepeatSettings:
 
 
 _NUMBER = re.compile(r"\d+")
-# Clients of the page, and a disk that is full again after each pair, cause messages without end.
-_FLOODED = ("uvicorn", "bodyschema.daemon.sampler.reconnect")
+# Clients of the page, a loose plug, and a disk that is full again after each pair cause messages without end.
+_FLOODED = ("uvicorn", "bodyschema.daemon.sampler.pair_writer", "bodyschema.daemon.sampler.reconnect")
 
 
 class PlainFormatter(logging.Formatter):

@@ -11,8 +11,8 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.net_evidence import WorthSettings
 from bodyschema.diagnosis.fit.noise import is_autocorrelated
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
+from bodyschema.diagnosis.search.joint_selection import estimated_tolerances, exceeds_tolerances, is_at_limit
 from bodyschema.diagnosis.search.search import Search, cause_counts, describe
-from bodyschema.diagnosis.search.together import estimated_tolerances, exceeds_tolerances, is_at_limit
 from bodyschema.diagnosis.unnamed.family_fits import FitWithDiscrepancy, PreparedFamily, UnnamedFamilies
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray

@@ -14,8 +14,8 @@ from bodyschema.diagnosis.fit.background import BackgroundSettings
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.net_evidence import WorthSettings, evidence_gain
 from bodyschema.diagnosis.search.drives import alias_sentences
+from bodyschema.diagnosis.search.joint_selection import is_at_limit
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect, Identity
 from bodyschema.interfaces.records import FloatArray
 from kbmaps.robust import HALF_WIDTH_95

@@ -237,7 +237,8 @@ def _done(diagnosis: Diagnosis, file: DiagnosisFile, about: About) -> str:
         f"<p>{len(diagnosis.hypotheses.effects)} hypotheses, each effect at each place where it can sit, were tried "
         "as extensions of the simulation, alone and beside each other. Their numbers were fitted to all samples "
         "together by maximum likelihood, with a share of outliers. An effect was added if it made the data "
-        "more probable by more than its freedom and the number of trials explain, and removed when others made it redundant. Every "
+        "more probable by more than its freedom and the number of trials explain, and removed when others made it "
+        "redundant. Every "
         f"error on this page is of held-out samples: {diagnosis.blocks.count} blocks of time, left out in turn. "
         f"Intervals of gains are from a bootstrap over blocks: neighbouring samples are not independent.</p>{left_out}"
         f'<p class="of">bodyschema {escape(about.version)}, {file.pairs.total:,} samples of {escape(about.recording)}, '

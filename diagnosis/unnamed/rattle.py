@@ -10,7 +10,7 @@ from scipy.special import xlogy
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.search.together import estimated_tolerances
+from bodyschema.diagnosis.search.joint_selection import estimated_tolerances
 from bodyschema.interfaces.records import FloatArray
 
 

@@ -18,7 +18,7 @@ from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.link import Link, LinkSettings, OpenLink, Sample, open_zenoh
 from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state
 from bodyschema.drivers.ros2.senders import Refusal, Sender, SpeedGates
-from bodyschema.drivers.turns import FASTEST_M_S, FASTEST_RAD_S
+from bodyschema.drivers.speed_gate import FASTEST_M_S, FASTEST_RAD_S
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array

@@ -9,7 +9,7 @@ from enum import StrEnum
 from statistics import median
 
 from bodyschema.drivers.device_clock import DeviceClock
-from bodyschema.drivers.turns import SpeedGate
+from bodyschema.drivers.speed_gate import SpeedGate
 
 TICK_S = 1e-9
 

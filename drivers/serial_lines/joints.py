@@ -12,8 +12,8 @@ from typing import Self
 from bodyschema.drivers.checks import Check, CheckSettings, aligned, warned
 from bodyschema.drivers.echo import BITS_PER_BYTE, Port, close_quietly
 from bodyschema.drivers.serial_line import SerialLine, SerialLineSettings
+from bodyschema.drivers.speed_gate import FASTEST_RAD_S, SpeedGate
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
-from bodyschema.drivers.turns import FASTEST_RAD_S, SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array

@@ -14,8 +14,8 @@ from typing import Any, Self
 
 from bodyschema.drivers.echo import Port, close_quietly, without_echo
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
+from bodyschema.drivers.speed_gate import FASTEST_RAD_S, SpeedGate
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
-from bodyschema.drivers.turns import FASTEST_RAD_S, SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array

@@ -13,8 +13,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from bodyschema.daemon.sampler import reconnect
-from bodyschema.daemon.sampler.reconnect import ResilientWriter
+from bodyschema.daemon.sampler import pair_writer
+from bodyschema.daemon.sampler.pair_writer import ResilientWriter
 from bodyschema.daemon.service import logs
 from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.clock import SystemClock
@@ -85,7 +85,7 @@ def test_intermittently_full_disk_does_not_flood_log() -> None:
         writer.append(1, np.zeros(2), cast(MarkerFix, None))
     lines = [line.split(": ", 1)[1] for line in stream.getvalue().splitlines()]
     assert lines == ["the disk is full; it is tried again with each sample", "the disk takes samples again"]
-    logging.getLogger(reconnect.__name__).handlers[0].close()
+    logging.getLogger(pair_writer.__name__).handlers[0].close()
     assert "49 more times" in stream.getvalue()
 
 

@@ -12,9 +12,9 @@ from bodyschema.diagnosis.assess.rivals import assessments
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.net_evidence import WorthSettings, evidence_gain, required_rise
 from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.search.joint_selection import together
 from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.diagnosis.search.search import Search, complexity, contains
-from bodyschema.diagnosis.search.together import together
 from bodyschema.effects import Effect
 from bodyschema.robot.description import RobotDescription
 

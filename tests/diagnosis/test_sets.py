@@ -27,14 +27,14 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.net_evidence import choice_counts
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
-from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.sets import CauseSets
-from bodyschema.diagnosis.search.together import (
+from bodyschema.diagnosis.search.joint_selection import (
     _Linearisation,
     alternatives_to_tolerances,
     estimated_tolerances,
     together,
 )
+from bodyschema.diagnosis.search.scan import Candidate
+from bodyschema.diagnosis.search.sets import CauseSets
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 

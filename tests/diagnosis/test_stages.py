@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
+from bodyschema.diagnosis.progress import RIVALS, SEARCH, SETS, UNNAMED, Stages
 
 
 def test_progress_never_falls_and_names_its_stage() -> None:

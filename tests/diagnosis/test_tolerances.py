@@ -17,9 +17,9 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
+from bodyschema.diagnosis.search.joint_selection import estimated_tolerances, exceeds_tolerances
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.sets import CauseSets
-from bodyschema.diagnosis.search.together import estimated_tolerances, exceeds_tolerances
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bodyschema.drivers.device_clock import DeviceClock, StreamClock
 from bodyschema.drivers.serial_line import SerialLineSettings, adapter_latency_s
-from bodyschema.drivers.turns import SpeedGate, nearest_turn
+from bodyschema.drivers.speed_gate import SpeedGate, nearest_turn
 
 
 @given(st.integers(-(10**6), 10**6), st.floats(-1e6, 1e6))

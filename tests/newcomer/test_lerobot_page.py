@@ -21,7 +21,15 @@ ROWS = 300
 TRUST, AGAIN = (f"bodyschema calibrate {name}.csv --trust-urdf" for name in ("so101", "again"))
 INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE, SIMULATE_AGAIN, CORRECT_URDF = (
     next(command for command in commands_of(PAGE) if re.search(word, command))
-    for word in (r"init .*\./bus$", "simulate", "--markers", r"\.json$", r"\.json --write", "mended.toml", "--out calibrated")
+    for word in (
+        r"init .*\./bus$",
+        "simulate",
+        "--markers",
+        r"\.json$",
+        r"\.json --write",
+        "mended.toml",
+        "--out calibrated",
+    )
 )
 
 
