@@ -40,7 +40,7 @@ def main() -> dict[str, float]:
     for n, (angles, position) in enumerate(zip(q, x, strict=True), 1):
         learner.learn(angles, position)  # some 30 microseconds
         if n in (10, 100, 1000):
-            errors[f"{n} pairs"] = error_mm()
+            errors[f"{n} samples"] = error_mm()
     quiet = NLMS(learner.map, mu0=0.05)  # small steps average the noise out
     quiet.replay(q, x, order=np.concatenate([rng.permutation(1000) for _ in range(20)]))
     learner = quiet

@@ -41,17 +41,17 @@ def main() -> dict[str, float]:
 
     judge("drawing")
     learn(300)
-    judge("first tool, 300 pairs")
+    judge("first tool, 300 samples")
 
     arm = arm.with_tool([0.0, 0.0, 0.2])  # 200 mm longer
-    judge("second tool, no pair of it")
+    judge("second tool, no sample of it")
     learner.tool_changed(0.2)
     learn(1)
-    judge("second tool, 1 pair")
+    judge("second tool, 1 sample")
     learn(9)
-    judge("second tool, 10 pairs")
+    judge("second tool, 10 samples")
     learn(20)
-    judge("second tool, 30 pairs")
+    judge("second tool, 30 samples")
     return errors
 
 

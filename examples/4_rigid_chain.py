@@ -36,9 +36,11 @@ def main(folder: Path) -> dict[str, object]:
     print(report := learner.report())
 
     there = learner.estimate(poses[30])
-    print("1-sigma of another pose [mm]", (1e3 * there.sigma).round(2), "near the pairs" if there.in_support else "far")
+    print(
+        "1-sigma of another pose [mm]", (1e3 * there.sigma).round(2), "near the samples" if there.in_support else "far"
+    )
     q_next = next_pose(ChainPosterior.of(learner), region=poses, candidates=poses)
-    print("the pair that would teach most is at [deg]", np.degrees(q_next).round())
+    print("the sample that would teach most is at [deg]", np.degrees(q_next).round())
 
     x = real.positions(poses[31])
     reached = InverseKinematics(learner, robot.lower, robot.upper).solve(x, start=poses[30])
@@ -50,7 +52,7 @@ def main(folder: Path) -> dict[str, object]:
 
     moved = {"T_measured_nominal": report.T_measured_nominal, "zeros": report.zeros.value}
     geometry = CalibratedGeometry.of(robot, again.chain, **moved)
-    written = write_calibrated(robot, geometry, folder / "calibrated", "calibrated from 30 pairs")
+    written = write_calibrated(robot, geometry, folder / "calibrated", "calibrated from 30 samples")
     return {"real": real, "report": report, "learner": learner, "again": again, "miss": miss, "written": written}
 
 

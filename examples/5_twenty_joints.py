@@ -42,7 +42,7 @@ def main() -> dict[str, float]:
         learner = RigidLearner(drawing, rough)
         learner.learn(q, parameters.positions(change, q) + sigma * rng.normal(size=(PAIRS, 3)))
         figures[f"{1e3 * sigma:.0f} mm of noise"] = error_mm(learner.predict(poses))
-        print(f"{PAIRS} pairs with {1e3 * sigma:.0f} mm of noise learnt in {time.perf_counter() - begin:.1f} s")
+        print(f"{PAIRS} samples with {1e3 * sigma:.0f} mm of noise learnt in {time.perf_counter() - begin:.1f} s")
     print(f"a KB-Map would have {3 * 3**JOINTS:,} numbers, the chain has {parameters.size}")
     for what, error in figures.items():
         print(f"{what:>14}: {error:.3g} mm mean error on other poses")

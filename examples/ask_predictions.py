@@ -45,7 +45,7 @@ def main(robot: str, endpoint: str, *angles: str) -> None:
         print(f"x = {x} m, 1-sigma {sigma} m, {where}")
         if pose["matrix"] is not None:  # an orientation is learnt
             print(f"T = {pose['matrix']}, covariance of x, y, z and turns {pose['covariance']} m², rad²")
-    print(f"model {reply['model']} of {reply['pairs']} pairs")
+    print(f"model {reply['model']} of {reply['pairs']} samples")
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def follow(session: zenoh.Session, prefix: str, first: int) -> Iterator[dict]:
         store = store or page["store"]
         if page["store"] != store:
             subscriber.undeclare()
-            raise RuntimeError(f"the pairs of store {store} have ended; those of {page['store']} begin at 1")
+            raise RuntimeError(f"the samples of store {store} have ended; those of {page['store']} begin at 1")
         for pair in page["pairs"]:
             last = pair["seq"]
             yield pair

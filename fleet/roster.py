@@ -188,7 +188,7 @@ def screen(members: Sequence[Member], unreachable: Sequence[str]) -> RenderableT
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("robot", overflow="fold")
     table.add_column("state", no_wrap=True)
-    for name in ("pairs", "a second", "error", "expected"):
+    for name in ("samples", "a second", "error", "expected"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("answers", no_wrap=True)
     table.add_column("health", justify="right", no_wrap=True)

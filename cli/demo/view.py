@@ -53,7 +53,7 @@ class _Lines:
             truth, what = f"{truth} {degrees(verdict.angle_rad)}", ""  # no room for both
         line = (
             f"{learner.pairs:5d} of {snapshot.target} samples; "
-            f"{what}next sample {mm(learner.prequential_m.get(learner.answering))}, "
+            f"{what}next {mm(learner.prequential_m.get(learner.answering))}, "
             f"claimed {mm(learner.claimed_error_m)}, held out {truth}"
         )
         if line != self._last_line:
@@ -118,7 +118,7 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     first, second = outcome.first_tool, outcome.second_tool
     table = Table(title="Mean error on held-out poses, against the simulated truth", title_justify="left")
     table.add_column("", no_wrap=True)
-    for heading in ("pairs", "nominal", "learnt", "claimed", "within 1σ"):
+    for heading in ("samples", "nominal", "learnt", "claimed", "within 1σ"):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, chapter in (("first tool", first), ("tool 250 mm longer", second)):
         table.add_row(

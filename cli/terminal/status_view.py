@@ -114,7 +114,7 @@ def _sampler(status: SamplerStatus) -> list[RenderableType]:
     reasons = ", ".join(f"{count} {reason}" for reason, count in rejected(status)) or "none"
     segments = f"{status.segment} segment{'' if status.segment == 1 else 's'}"
     facts = _facts()
-    facts.add_row("pairs", f"{status.pairs} in {segments}, {status.pairs_per_s:.1f}/s")
+    facts.add_row("samples", f"{status.pairs} in {segments}, {status.pairs_per_s:.1f}/s")
     facts.add_row("frames", f"{status.frames}, {status.frames_per_s:.1f}/s; readings {status.readings_per_s:.0f}/s")
     facts.add_row("rejected", reasons)
     for name, bus in status.buses.items():
@@ -136,7 +136,7 @@ def _learner(status: LearnerStatus) -> list[RenderableType]:
     doubted = f", {status.doubted} doubted" if status.doubted else ""
     refused = f", {status.refused} refused" if status.refused else ""
     facts = _facts()
-    facts.add_row("pairs", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
+    facts.add_row("samples", f"{status.pairs} learnt, {status.replayed} replay steps{doubted}{refused}")
     if status.behind:
         age = "" if status.age_s is None else f"; the newest learnt is {_duration(status.age_s)} old"
         facts.add_row("", f"{status.behind} stored and not learnt yet{age}")
