@@ -214,7 +214,7 @@ def test_pause_and_resume_are_one_button(page) -> None:
 
 
 def test_tool_change_is_confirmed_and_marked(page) -> None:
-    says(page, "#error-text", "pairs")
+    says(page, "#error-text", "samples")
     page.click("#tool")
     page.keyboard.press("Escape")
     expect(page.locator("#tool-dialog")).to_be_hidden()
