@@ -49,7 +49,7 @@ def at_the_commit(kill: Countdown) -> None:
         nonlocal inserted
         if inserted and statement == "COMMIT":
             kill()
-        inserted = statement.startswith("INSERT") and " INTO samples " in statement
+        inserted = statement.startswith("INSERT") and " INTO pairs " in statement
 
     def traced(*args: Any, **kwargs: Any) -> sqlite3.Connection:
         connection = connect(*args, **kwargs)
