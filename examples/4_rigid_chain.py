@@ -36,9 +36,7 @@ def main(folder: Path) -> dict[str, object]:
     print(report := learner.report())
 
     there = learner.estimate(poses[30])
-    print(
-        "1-sigma of another pose [mm]", (1e3 * there.sigma).round(2), "near the samples" if there.in_support else "far"
-    )
+    print("1-sigma of another pose [mm]", (1e3 * there.sigma).round(2), "near samples" if there.in_support else "far")
     q_next = next_pose(ChainPosterior.of(learner), region=poses, candidates=poses)
     print("the sample that would teach most is at [deg]", np.degrees(q_next).round())
 
