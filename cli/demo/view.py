@@ -133,7 +133,7 @@ def show_outcome(console: Console, outcome: Outcome, scene: Scene) -> None:
     console.print(table)
     console.print(
         "Held-out poses lie within a few degrees of where the arm was guided with that tool; none was learnt. "
-        "The claim is the learner's own, who does not know the truth. A third process asked for "
+        "Claimed errors are the learner's own estimates. A third process asked for "
         f"{outcome.answers + outcome.unanswered} predictions meanwhile; {outcome.unanswered} went unanswered."
     )
     for name, chapter in (("first tool", first), ("tool 250 mm longer", second)):
