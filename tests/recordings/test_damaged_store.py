@@ -305,7 +305,7 @@ class Flips:
         try:
             return len(self._true) - len(from_store(file))
         except RecordingError as error:
-            if "the store has no pairs" not in str(error):
+            if "the store has no samples" not in str(error):
                 raise
         return PAIRS
 
