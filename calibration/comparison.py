@@ -63,7 +63,7 @@ class LeftOut(msgspec.Struct, frozen=True):
     # first, second: number of rows of each recording without a match in the other
     first: int
     second: int
-    first_row: int | None  # number of the first such row of the first recording; None if there is none
+    first_row: int | None  # number of the first such row of the first recording, or None
     second_row: int | None  # the same for the second
     # joint, by: the joint that differs most between the first unmatched row and the row of the same number in the
     # other recording, and by how much [rad, m]

@@ -80,7 +80,7 @@ class Diagnoses:
         self._end()
 
     def report(self) -> bytes | None:
-        """Return the page of the last diagnosis; None if there is none."""
+        """Return the page of the last diagnosis, or None."""
         number = self._document.report
         return None if number is None else (self._output(number) / REPORT).read_bytes()
 

@@ -32,7 +32,7 @@ class SeriesDocument(msgspec.Struct, frozen=True):
     """Time series of figures since the view began, columns of equal length."""
 
     t: list[float]  # UTC [s since 1970]
-    # error on new pairs of the answering model [m], measurement noise included; null while there is none
+    # error on new samples of the answering model [m], measurement noise included; null if missing
     error_m: list[float | None]
     # error that the learner expects on new pairs in its support, measurement noise included [m]
     expected_m: list[float | None]
@@ -160,4 +160,4 @@ class DiagnosisDocument(msgspec.Struct, frozen=True):
     said: str = ""  # current step, result, or error
     started: float | None = None  # UTC [s since 1970]
     verdict: str | None = None  # of diagnosis.json; null unless it is done
-    report: int | None = None  # number of the diagnosis whose report is available; null if there is none
+    report: int | None = None  # number of the diagnosis whose report is available; null if missing

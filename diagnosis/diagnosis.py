@@ -121,7 +121,7 @@ class Diagnosis:
 
     @cached_property
     def without_model(self) -> FloatArray | None:
-        """Held-out distances (n,) [m] with causes and tolerances but no smooth model; None if there is none."""
+        """Held-out distances (n,) [m] with causes and tolerances but no smooth model, or None."""
         if self.unexplained.model is None or self.unexplained.model.stored is None or self.leaves_out:
             return None
         return np.linalg.norm(held_out_errors(self.without_smooth_model, self.blocks), axis=1)

@@ -441,7 +441,7 @@ class Effect:
         return replace(self, ordinal=ordinal)
 
     def value(self, name: str) -> float:
-        """Return the value called `name`; raise KeyError if there is none."""
+        """Return the value called `name`; raise KeyError if it is missing."""
         named = dict(zip([parameter.name for parameter in self.parameters], self.values.tolist(), strict=True))
         return named[name]
 

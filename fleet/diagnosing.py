@@ -96,7 +96,7 @@ class Diagnosed:
     job: Job  # the recording
     robot: str  # name of its robot
     joints: tuple[str, ...]  # of its robot; empty if its description could not be read
-    file: DiagnosisFile | None = None  # the diagnosis; None if there is none
+    file: DiagnosisFile | None = None  # the diagnosis, or None
     timed: bool = False  # True if the recording has times
     error: str | None = None  # the reason why there is none
 

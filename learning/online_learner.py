@@ -303,7 +303,7 @@ class OnlineLearner:
         self._solving.solve_soon()
 
     def work(self) -> bool:
-        """Do one small piece of background work; return False if there is none."""
+        """Do one small piece of background work; return False if nothing was left to do."""
         return self._fit() or self._review_change() or self._serve_solver() or self._replay()
 
     def state(self) -> LearningState:

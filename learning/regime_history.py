@@ -223,7 +223,7 @@ class Regimes:
         return True
 
     def detected(self, regime: Regime, pair: Pair) -> DetectedChange | None:
-        """Return the change detected in the pairs of `regime`, the last of which is `pair`; None if there is none."""
+        """Return the change detected in the pairs of `regime`, the last of which is `pair`, or None."""
         if not regime.monitor.ready:
             return None
         gate = regime.gate

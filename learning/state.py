@@ -65,7 +65,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     # state of the orientation models; None in a checkpoint of an older version
     orientation: OrientationState | None = None
     change: ChangeRecord | None = None  # the last change; None if there was none
-    # the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE_PREFIX`.
+    # the state before it, for rollback, or None. Its arrays' names begin with `BEFORE_PREFIX`.
     before: LearningHeader | None = None
 
 
@@ -82,7 +82,7 @@ class LearningState:
 
     @property
     def before(self) -> LearningState | None:
-        """State before the last change; None if there is none."""
+        """State before the last change, or None."""
         if self.header.before is None:
             return None
         arrays = {

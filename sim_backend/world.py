@@ -177,7 +177,7 @@ class SimWorld:
             return stereo_frame(t, images)
 
     def _take_frames(self, end: float) -> bool:
-        """Advance until the renderer has frames to render ahead; return False if there is none in time."""
+        """Advance until the renderer has frames to render ahead; return False if it did not within the time."""
         with self._moved:
             while self._may_take_frame():
                 self._check_open(self._camera_open)

@@ -84,7 +84,7 @@ class ServoLog:
         return {batch: list(entries) for batch, entries in groupby(ordered, key=lambda entry: entry.batch)}
 
     def to_undo(self) -> list[LoggedWrite]:
-        """Return the newest batch that changed something and was not undone; empty if there is none."""
+        """Return the newest batch that changed something and was not undone; may be empty."""
         batches = self.batches()
         undone = {entries[0].undoes for entries in batches.values() if any(e.state == "written" for e in entries)}
         for number in sorted(batches, reverse=True):

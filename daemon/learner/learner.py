@@ -326,7 +326,7 @@ class Learner:
             self._failure = error
 
     def work(self) -> bool:
-        """Do a piece of background work; return False if there is none. SolverLostError: the solver lost its pairs."""
+        """Do a piece of background work; return False if nothing is left; SolverLostError: the solver lost pairs."""
         self._findings.renew()
         worked = self._learning.work()
         pairs = self._learning.counters.pairs

@@ -22,7 +22,7 @@ _HERE = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNOREC
 
 
 def host_refusal(hosts: Iterable[str]) -> str | None:
-    """Return the fault of a request's Host headers, as a message; None if there is none."""
+    """Return the fault of a request's Host headers, as a message, or None."""
     found = list(hosts)
     if len(found) == 1 and _HERE.fullmatch(found[0]):
         return None

@@ -78,7 +78,7 @@ class Service:
             self._notifier.ready()
 
     def forbidden(self) -> str | None:
-        """Return an existing device that this service has not been able to open for a while; None if there is none.
+        """Return an existing device that this service has not been able to open for a while, or None.
 
         systemd resolves device names when it starts a service. A device that comes back under another number is
         accessible after a restart of the service.

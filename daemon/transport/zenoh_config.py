@@ -24,7 +24,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sampler: str = "tcp/127.0.0.1:7447"
     learner: str = "tcp/127.0.0.1:7448"
     # endpoint where machines meet: both processes connect to it too, and clients that do not find them on this machine
-    # ask there; empty if there is none
+    # ask there; may be empty
     router: str = ""
     tls: TlsConfig | None = None  # certificates; required for every endpoint beyond this machine
     login: LoginConfig | None = None  # name and password for a router or a process that asks for them

@@ -31,7 +31,7 @@ class UnnamedAlternative:
     def in_place_of(
         cls, cause: Effect, fit: Fit, tried: Iterable[FitWithDiscrepancy], unnamed: UnnamedFamilies, search: Search
     ) -> UnnamedAlternative | None:
-        """Return the most probable one; None if there is none to test.
+        """Return the most probable one, or None if none can be tested.
 
         Args:
             fit: the fit with the cause.

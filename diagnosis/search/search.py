@@ -130,7 +130,7 @@ class LeaveOneOut:
         return improved(self._fit.with_unfitted_causes(self.others), threshold).log_likelihood > threshold
 
     def better_moment(self) -> Fit | None:
-        """Refit with a better moment or period of the cause; None if there is none."""
+        """Refit with a better moment or period of the cause, or None."""
         fit, cause = self._fit, self._cause
         threshold = fit.log_likelihood + _Settings.better_moment
         tried = [self.hypothesis] if self.hypothesis.gain > self.gain + _Settings.better_moment else []

@@ -55,7 +55,7 @@ class ServoState:
     """Part of one servo's control table while it has torque."""
 
     has_torque: bool  # its torque is on
-    trouble: str  # its hardware error, in words; empty when there is none
+    trouble: str  # its hardware error, in words; may be empty
     watchdog: int  # Bus Watchdog: negative after it has fired, 0 while it is not armed
     took_goal: bool  # its goal is the one that was sent last
     temperature_c: float  # measured [°C]

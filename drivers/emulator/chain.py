@@ -101,7 +101,7 @@ class ServoChain(AnswerOnlyDevice, ABC, Generic[ServoT]):
         self._byte_s = 0.0
 
     def servo(self, id: int) -> ServoT:
-        """Return the first servo with this ID; raise KeyError if there is none."""
+        """Return the first servo with this ID; raise KeyError if it is missing."""
         for servo in self.servos:
             if servo.id == id:
                 return servo

@@ -43,7 +43,7 @@ class Device(Protocol):
 
     @property
     def speaks_at(self) -> float:
-        """Time of the next unsolicited transmission [s]; infinity if there is none."""
+        """Time of the next unsolicited transmission [s]; infinity if it sends nothing."""
         ...
 
     def speak(self, until: float, baud: int) -> list[Reply]:

@@ -21,7 +21,7 @@ class KnownArm:
 
     chain: ChainBelief  # posterior as a rigid chain
     tolerances: ChainTolerances  # those of its prior
-    residual: ResidualModel | None = None  # posterior as a chain with deviations; None if there is none
+    residual: ResidualModel | None = None  # posterior as a chain with deviations, or None
 
     @classmethod
     def from_bytes(cls, chain: bytes, tolerances: ChainTolerances, residual: bytes | None) -> KnownArm:

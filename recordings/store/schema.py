@@ -156,7 +156,7 @@ def migrate(connection: sqlite3.Connection) -> None:
 
 
 def trouble(connection: sqlite3.Connection) -> str | None:
-    """Return the problem with the file's pages or its identity; None if there is none."""
+    """Return the problem with the file's pages or its identity, or None."""
     try:
         found = connection.execute("PRAGMA quick_check(1)").fetchone()[0].decode(errors="replace")
         if found == "ok":
@@ -234,7 +234,7 @@ def _pair_columns(schema: int) -> list[str]:
 
 
 def _schema_mismatch(connection: sqlite3.Connection, schema: int) -> str | None:
-    """Return a difference between the file and a pair store of this schema; None if there is none."""
+    """Return a difference between the file and a pair store of this schema, or None."""
     if connection.execute("PRAGMA encoding").fetchone()[0] != b"UTF-8":
         return "its texts are not UTF-8"
     trigger = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'trigger'").fetchone()

@@ -96,8 +96,8 @@ class Audit:
     """Result of checking each row of a store."""
 
     pairs: int  # number of sound pairs
-    newest: int  # number of the newest pair, sound or not; 0 if there is none
-    session: int  # session of the newest sound pair; 0 if there is none
+    newest: int  # number of the newest pair, sound or not; 0 in an empty store
+    session: int  # session of the newest sound pair; 0 in an empty store
     damage: Damage  # numbers of pairs that cannot be read
     lost_rows: int  # number of existing but unreadable rows, of pairs and of related tables
     # smallest and largest joint angles, each shape (d,) [rad or m]; None if there is no pair
@@ -158,7 +158,7 @@ class PairReader:
         return pairs
 
     def last(self) -> Pair | None:
-        """Return the newest sound pair, or None if there is none."""
+        """Return the newest sound pair, or None."""
         with self._reading() as connection:
             try:
                 back = scan_back(connection, self._columns, self._pair)
@@ -169,7 +169,7 @@ class PairReader:
             return max(scan(connection, self._columns, self._pair), key=lambda pair: pair.seq, default=None)
 
     def last_seq(self) -> int:
-        """Return the sequence number of the newest pair, sound or not; 0 if there is none."""
+        """Return the sequence number of the newest pair, sound or not; 0 in an empty store."""
         with self._reading() as connection:
             behind, newest = 0, 0
             try:
@@ -185,7 +185,7 @@ class PairReader:
             return max(newest + behind, self._given_up_to)
 
     def first_seq(self) -> int:
-        """Return the sequence number of the oldest pair; 1 if there is none."""
+        """Return the sequence number of the oldest pair; 1 in an empty store."""
         with self._reading() as connection:
             return oldest(connection)
 
@@ -194,7 +194,7 @@ class PairReader:
         return self.damage.since(self.first_seq()) if self.damage.count else self.damage
 
     def trouble(self) -> str | None:
-        """Return the problem with the file's pages; None if there is none."""
+        """Return the problem with the file's pages, or None."""
         with self._reading() as connection:
             return store_schema.trouble(connection)
 

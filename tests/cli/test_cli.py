@@ -305,6 +305,7 @@ def test_the_earlier_names_answer_with_the_present_one(capsys) -> None:
     assert present_names(["fleet", "a.csv"]) == ["fleet", "a.csv"]
     assert present_names(["robot", "new", "--urdf", "a"]) == ["init", "--from", "scan", "--urdf", "a"]
     assert present_names(["config", "init", "--sim"]) == ["init", "--sim"]
+    assert present_names(["bench", "--port", "./bus"]) == ["emulate", "--port", "./bus"]
     assert "bodyschema config init is now: bodyschema init\n" in capsys.readouterr().err
 
 

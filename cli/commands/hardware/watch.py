@@ -174,7 +174,7 @@ def _line(text: str) -> None:
 
 
 def _first(watch: JointsWatch) -> ArmState:
-    """Return the first complete state; raise SourceError if there is none in time."""
+    """Return the first complete state; raise SourceError if it does not come in time."""
     end = time.monotonic() + _Settings.first_reading_s
     while time.monotonic() < end:
         if watch.look() is not None:
